@@ -61,6 +61,7 @@ const texts = {
   "contract.ts": contract(`export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
 export const outputs: Described = ${JSON.stringify(described(schemas.Scene.properties.outputs), null, 1)};
 export const within: Described = ${JSON.stringify(described(only(schemas.LocalizeBody, ["within_mm", "within_deg"])), null, 1)};
+export const namedProbes = ${JSON.stringify(schemas.Probe["x-named"], null, 1)};
 export const renderedAs: Described = ${JSON.stringify(described(schemas.RenderSpecification.properties.format), null, 1)};
 export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
 export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;

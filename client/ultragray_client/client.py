@@ -106,6 +106,37 @@ class Scenes(Group[AnyConnection]):
         """Frees a scene's memory; the number of render processes that still hold it."""
         return Call("SceneService.UnloadScene", scenes_pb2.UnloadSceneRequest(scene=name), _loaded, timeout_s)
 
+    @operation
+    def label(
+        self,
+        name: str,
+        *,
+        into: str,
+        frames: Iterable[tuple[PoseLike, bytes]] = (),
+        label_map: bytes | None = None,
+        label_names: Mapping[int, str] | None = None,
+        within_mm: float = 4.0,
+        probe: Probe | None = None,
+        registration: str | None = None,
+        replace: bool = False,
+        private: bool = False,
+        timeout_s: float | None = None,
+    ) -> Call[Scene]:
+        """Labels the Gaussians of a scene, as the scene `into`, by painted frames or by a label map.
+
+        `frames`: poses of `probe` (None: the scene's own) and grey PNG files of 8 bits, rows along depth, columns
+        across scan lines: the label of each pixel, 0: no label, 255: not painted. `label_map`: the bytes of a NIfTI-1
+        file. Gaussians that neither reaches take the label of labelled ones `within_mm` that echo alike. `replace`:
+        `into` may be a scene that is there, the key's own, with the same Gaussians. `registration` leads poses, or the
+        map, into the scene. Raises SceneNotFound, SceneExists, SceneReadOnly, PermissionDenied, InvalidArgument and
+        its kinds.
+        """
+        asked = {"into": into, "replace": replace, "private": private, "within_mm": within_mm, "probe": probe}
+        known = {"registration": registration, "label_names": dict(label_names or {}), "label_map": label_map}
+        painted = [scenes_pb2.PaintedFrame(pose=pose_message(pose), labels=labels) for pose, labels in frames]
+        request = message_of({**asked, **known}, scenes_pb2.LabelSceneRequest, scene=name, frames=painted)
+        return Call("SceneService.LabelScene", request, scene_from_message, timeout_s)
+
 
 class Datasets(Group[AnyConnection]):
     """`client.datasets`. All raise ClientError; a name that does not exist is DatasetNotFound."""

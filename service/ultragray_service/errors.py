@@ -84,8 +84,8 @@ class StreamNotFound(UltragrayError, title="No such open stream"):
     """No open stream of that id that the key may watch: it has ended, or is at another service of the same address."""
 
 
-class SceneReadOnly(UltragrayError, title="Scene cannot be deleted"):
-    """A scene of the data folder cannot be deleted over HTTP."""
+class SceneReadOnly(UltragrayError, title="Scene cannot be changed"):
+    """A scene of the data folder can neither be deleted nor get other labels over the service."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.jobs import Jobs
+from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -33,7 +34,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
+from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import RenderPool
@@ -65,6 +66,7 @@ class Service:
     jobs: Jobs
     uploads: DatasetUploads
     imports: SceneImports
+    labels: SceneLabels
     # What is made of it.
     pool: RenderPool
     planner: RequestPlanner
@@ -73,6 +75,7 @@ class Service:
     assessing: Assessing
     dataset_views: DatasetViews
     comparisons: Comparisons
+    thumbnails: Thumbnails
     training_views: TrainingViews
     # How it goes.
     readiness: Readiness
@@ -80,7 +83,8 @@ class Service:
     tracing: Tracing | None
 
     def __post_init__(self) -> None:
-        self._prepared = (self.dataset_views, self.comparisons, self.training_views)
+        self._of_datasets = (self.dataset_views, self.comparisons, self.training_views)
+        self._prepared = (*self._of_datasets, self.thumbnails)
         self._following: list[asyncio.Task[None]] = []
         self._snapshot: Snapshot | None = None
 
@@ -155,5 +159,5 @@ class Service:
         await self.training_views.forget_job(job_id)
 
     async def _forget(self, is_doomed: Callable[[str], bool]) -> None:
-        for prepared in self._prepared:
+        for prepared in self._of_datasets:
             await prepared.forget(is_doomed)

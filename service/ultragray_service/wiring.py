@@ -15,6 +15,7 @@ from ultragray_service.access.origins import Origins
 from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.jobs import Jobs
+from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -29,7 +30,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
+from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
@@ -74,9 +75,11 @@ def make_service(settings: Settings) -> Service:
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
-    # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
-    checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
+    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
+    # labels a scene, and one draws thumbnails, which would wait behind pictures for minutes.
+    checks, pictures, labelling, thumbnails = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(4))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
+    imports = SceneImports(scenes, places.made, means)
     return Service(
         settings=settings,
         life=life,
@@ -98,7 +101,8 @@ def make_service(settings: Settings) -> Service:
         registrations=registrations,
         jobs=jobs,
         uploads=DatasetUploads(datasets, means),
-        imports=SceneImports(scenes, places.made, means),
+        imports=imports,
+        labels=SceneLabels(scenes, imports, registrations, owners, labelling, life),
         pool=pool,
         planner=planner,
         rendering=rendering,
@@ -106,6 +110,7 @@ def make_service(settings: Settings) -> Service:
         assessing=Assessing(catalog, registrations),
         dataset_views=DatasetViews(datasets, settings, pictures),
         comparisons=Comparisons(scenes, catalog, datasets, settings, pictures),
+        thumbnails=Thumbnails(scenes, catalog, settings, thumbnails),
         training_views=TrainingViews(jobs, datasets, settings, pictures),
         readiness=Readiness(
             lambda: jobs.database,

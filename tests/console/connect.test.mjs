@@ -19,13 +19,17 @@ const ROS = `
 import json, shlex, sys, yaml
 from ultragray_client import Client, Placement, Quaternion
 from ultragray_ros.parameters import defaults, settings_of
-comment, command = open(sys.argv[1]).read().split("ultragray-ros", 1)
-words = shlex.split(command.replace("\\\\\\n", " "))
+command, publish = (open(name).read() for name in sys.argv[1:])
+words = shlex.split(command.partition("ultragray-ros ")[2].partition("\\n#")[0].replace("\\\\\\n", " "))
 assert words[0] == "--ros-args" and set(words[1::2]) == {"-p"}, words
 given = {name: yaml.safe_load(value) for name, _, value in (word.partition(":=") for word in words[2::2])}
 known = {"address": "", "scene": "", "scene_frame": "scene", **defaults()}
 assert {name: type(value) for name, value in given.items()} == {name: type(known[name]) for name in given}, given
-stamped = yaml.safe_load(shlex.split(comment, comments=False)[-1])
+publish, _, transform = publish.partition("\\n#")
+stamped = yaml.safe_load(shlex.split(publish)[-1])
+still = shlex.split(transform.splitlines()[1].removeprefix("# "))
+assert [float(still[still.index(f"--{axis}") + 1]) for axis in "xyz"] == [stamped["pose"]["position"][axis] for axis in "xyz"], still
+assert f"ultragray.launch.xml address:={given['address']} scene:={given['scene']}" in command, command
 assert stamped["header"]["frame_id"] == {**known, **given}["scene_frame"], command
 place, turn = stamped["pose"]["position"], stamped["pose"]["orientation"]
 pose = Placement(tuple(1000 * place[axis] for axis in "xyz"), Quaternion(**turn))
@@ -57,10 +61,10 @@ let folder;
 before(() => (folder = mkdtempSync(path.join(tmpdir(), "ultragray-connect-"))));
 after(() => rmSync(folder, { recursive: true, force: true }));
 
-async function program(page, language) {
+async function program(page, language, place = 0) {
   await page.getByLabel("Language of the example").selectOption(language);
-  await page.getByRole("button", { name: /^Copy the example in/ }).click();
-  const text = await page.getByTestId("snippet").inputValue();
+  await page.getByRole("button", { name: /^Copy the example in/ }).nth(place).click();
+  const text = await page.getByTestId("snippet").nth(place).inputValue();
   assert.equal(await page.evaluate(() => navigator.clipboard.readText()), text);
   return text;
 }
@@ -121,7 +125,7 @@ describe("connect", () => {
     assert.equal(streamed.length, 50);
     assert.match(streamed[49], new RegExp(`^49 \\(1, ${height}, ${width}\\)`));
     assert.match(run(PYTHON, written("igtl.py", await program(page, "igtl"))), /\(1, 256, 256\)/);
-    const image = JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))));
+    const image = JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros")), written("pose.sh", await program(page, "ros", 1))));
     assert.deepEqual(image, [height, width, 6, "convex", ["needle", "box"]]);
     await picture(page, "connect");
     assert.deepEqual(page.faults, []);
@@ -159,9 +163,9 @@ describe("connect", () => {
     assert.match(run(PYTHON, written("ask.py", asking)), /bmode \d+x\d+/);
     const call = written("grpcurl.sh", await program(page, "grpc"));
     assert.match(run(PYTHON, "-c", GRPCURL, call), /^\d+ \d+ \d+ \[\]/);
-    const node = await program(page, "ros");
-    assert.match(node, /frame_id: base/);
-    assert.equal(JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", node)))[3], "linear");
+    const [node, pose] = [await program(page, "ros"), await program(page, "ros", 1)];
+    assert.match(pose, /frame_id: base/);
+    assert.equal(JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", node), written("pose.sh", pose)))[3], "linear");
     await program(page, "igtl");
     await page.getByText("names a registration by the parameter Registration").waitFor();
     assert.deepEqual(page.faults, []);

@@ -1,10 +1,13 @@
 /** The pose in numbers and as text, and paths of the probe: loaded, recorded, saved, rendered. */
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import path from "node:path";
 import { describe, it } from "node:test";
 
-import { BACKGROUND_TIMEOUT_MS, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, picture, PYTHON, seriousFindings, until } from "./harness.mjs";
 import { enterPose, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
@@ -128,9 +131,66 @@ describe("the path of the probe", () => {
     await picture(page, "path-recorded");
 
     await page.getByRole("button", { name: "Render as a data set" }).click();
-    const job = page.getByTestId("path-job");
-    await until(() => job.textContent(), (text) => text.includes("Done"), "the job is not done", BACKGROUND_TIMEOUT_MS);
-    await page.getByRole("link", { name: /^Download .*npz/ }).waitFor();
+    await page.getByTestId("path-job").click();
+    await page.getByTestId("job-state").getByText("succeeded").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
+    await page.getByRole("link", { name: "frames.npz" }).waitFor();
+    const rendered = page.getByRole("region", { name: "Rendered frames" });
+    await until(() => rendered.getByRole("img").count(), (count) => count === 6, "no examples");
+    await until(() => rendered.locator("figure img").evaluateAll((all) => all.every((one) => one.naturalWidth >= 200)), Boolean, "they are empty");
+    await rendered.getByText("Frame 0", { exact: true }).waitFor();
+    assert.match(await rendered.getByTestId("confidence-range").textContent(), /^Confidence 0\.\d\d to 0\.\d\d, mean 0\.\d\d$/);
+    assert.match(await rendered.getByTestId("rendered-settings").textContent(), /Format\s*npz/);
+    const [file] = await Promise.all([page.waitForEvent("download"), page.getByRole("link", { name: "frames.npz" }).click()]);
+    const folder = mkdtempSync(path.join(tmpdir(), "ultragray-frames-"));
+    await file.saveAs(path.join(folder, "frames.npz"));
+    const program = await rendered.getByLabel("How Python loads them").inputValue();
+    assert.match(execFileSync(PYTHON, ["-c", program], { cwd: folder, encoding: "utf8" }), /'bmode'.*\(\d+, 256, 256\)/);
+    rmSync(folder, { recursive: true });
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "job-rendered");
     assert.deepEqual(page.faults, []);
+  });
+
+  it("leads smoothly through keyframes, and becomes a film", async () => {
+    const { page } = await openScan(at);
+    const keyframe = page.getByRole("button", { name: "Add keyframe" });
+    for (const y of [-10, 0, 10]) {
+      await type(page, "Position Y, mm", String(y));
+      if (y === 0) await type(page, "Rotate, about z, °", "20").catch(() => undefined);
+      await keyframe.click();
+    }
+    await page.getByLabel("Seconds between").fill("0.5");
+    await page.getByLabel("Seconds between").press("Enter");
+    await page.getByTestId("path-summary").getByText("31 poses").waitFor();
+    await page.getByTestId("place").getByText("pose 31 of 31").waitFor(); // the probe stays where it was
+    await page.getByLabel("Save poses", { exact: true }).selectOption("json");
+    const [poses] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save poses" }).click()]);
+    const saved = JSON.parse(readFileSync(await poses.path()));
+    const ys = saved.poses.map(({ position_mm }) => position_mm.y);
+    assert.deepEqual([ys[0], ys[15], ys[30]].map(Math.round), [-10, 0, 10]);
+    assert.ok(ys.every((y, i) => i === 0 || y > ys[i - 1]), "it goes back");
+    const steps = ys.slice(1).map((y, i) => y - ys[i]);
+    assert.ok(Math.max(...steps.slice(1).map((step, i) => Math.abs(step - steps[i]))) < 0.2, "it jerks");
+    await picture(page, "path-keyframes");
+    const [film] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save as film" }).click()]);
+    assert.match(film.suggestedFilename(), /^3 keyframes\.(webm|mp4)$/);
+    const bytes = readFileSync(await film.path());
+    assert.ok(bytes.length > 2000, `${bytes.length} bytes`);
+    assert.ok(bytes.subarray(0, 4).equals(Buffer.from([0x1a, 0x45, 0xdf, 0xa3])) || bytes.subarray(4, 8).toString() === "ftyp", "no video");
+    await page.getByRole("button", { name: "Without the last keyframe" }).click();
+    await page.getByTestId("path-summary").getByText("16 poses").waitFor();
+    assert.deepEqual(page.faults, []);
+  });
+
+  it("says what is wrong with a file until the person goes on", async () => {
+    const { page } = await openScan(at);
+    await load(page, "broken.tum", "0 1 2 3\n");
+    const problem = page.getByText("broken.tum: Line 1");
+    await problem.waitFor();
+    await page.getByLabel("Place in the training sweep").fill("3");
+    await problem.waitFor({ state: "detached" });
+    await load(page, "broken.tum", "0 1 2 3\n");
+    await page.getByRole("alert").filter({ has: problem }).getByRole("button", { name: "Close" }).click();
+    await problem.waitFor({ state: "detached" });
   });
 });

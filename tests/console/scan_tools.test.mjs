@@ -151,6 +151,22 @@ describe("the image", () => {
   });
 });
 
+describe("a probe by its name", () => {
+  it("is chosen as such, and is set nearer and farther by sliders", async () => {
+    const { page, first } = await openScan(at);
+    const probe = page.getByRole("combobox", { name: "Probe" });
+    await probe.selectOption("C5-2");
+    await changed(page, first.print);
+    const [near, far] = ["Near", "Far"].map((name) => page.getByRole("slider", { name, exact: true }));
+    assert.deepEqual([await near.inputValue(), await far.inputValue()], ["50", "200"]);
+    assert.equal(await probe.inputValue(), "C5-2");
+    await far.fill("120");
+    await until(() => probe.inputValue(), (kind) => kind === "convex", "it has still the name of another");
+    await until(() => near.getAttribute("max"), (most) => most === "119.5", "near may lie beyond far");
+    assert.deepEqual(page.faults, []);
+  });
+});
+
 describe("a scene that another takes the place of", () => {
   it("is not scanned with the probe that was chosen for it", async () => {
     const file = readFileSync(path.join(at.service.data, "demo.ugr"));

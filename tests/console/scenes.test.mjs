@@ -56,10 +56,12 @@ describe("scenes and service", () => {
       await row.getByText(text).first().waitFor();
     await put(at.service, "/v1/scenes/resting", readFileSync(at.files.compared), "application/octet-stream");
     const resting = page.getByTestId("scene-resting");
-    await resting.waitFor();
-    await page.waitForTimeout(1500);
-    assert.equal(await resting.locator("img").count(), 0, "a scene was loaded for its picture");
-    assert.equal(await resting.getByText("loaded", { exact: true }).count(), 0);
+    await resting.locator("img").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
+    const { scenes } = await (await fetch(`${at.service.url}/v1/scenes`)).json();
+    assert.equal(scenes.find(({ name }) => name === "resting").loaded, false, "it was loaded for its picture");
+    const address = `${at.service.url}/v1/scenes/resting/thumbnail.png`;
+    const { headers } = await fetch(address);
+    assert.equal((await fetch(address, { headers: { "If-None-Match": headers.get("etag") } })).status, 304);
     await row.getByRole("link", { name: "Compare demo" }).click();
     await until(() => page.url(), (url) => url.endsWith("#/compare/demo"), "it leads elsewhere");
   });

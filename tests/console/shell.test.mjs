@@ -50,6 +50,21 @@ describe("the header", () => {
   });
 });
 
+describe("a page that is older than the service", () => {
+  it("offers to load itself again where a part of it is not there any more", async () => {
+    const { page } = await openScan(at);
+    await page.route(/\/assets\/Compare-.*\.js$/, (route) => route.fulfill({ status: 404, body: "" }));
+    await goTo(page, "Compare");
+    const notice = page.getByRole("alert").filter({ hasText: "The service may have been renewed" });
+    await notice.waitFor();
+    await picture(page, "outdated");
+    await page.unroute(/\/assets\/Compare-.*\.js$/);
+    await Promise.all([page.waitForEvent("load"), notice.getByRole("button", { name: "Reload" }).click()]);
+    await page.getByLabel("Compare the truth with").or(page.getByText(/held-out frames/)).first().waitFor();
+    assert.equal(await notice.count(), 0);
+  });
+});
+
 describe("a console that nobody has set", () => {
   it("speaks the first of the browser's languages that it knows", async () => {
     for (const [locale, view] of [["de-AT", "Karten"], ["fr-FR", "Maps"]]) {

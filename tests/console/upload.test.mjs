@@ -53,6 +53,10 @@ describe("an upload", () => {
     assert.equal(await page.getByLabel("Steps").inputValue(), "77");
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await page.getByLabel("Live image").waitFor();
+    const sending = page.getByTestId("sending");
+    await sending.getByLabel("Upload of slow", { exact: true }).waitFor();
+    await picture(page, "upload-elsewhere");
+    assert.deepEqual(await seriousFindings(page), []);
     assert.equal(await asksBeforeClosing(page), true);
     await page.getByRole("link", { name: "Train", exact: true }).click();
     await progress.waitFor();
@@ -60,8 +64,31 @@ describe("an upload", () => {
     release();
     await page.getByRole("region", { name: "Dataset slow" }).waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     assert.equal(await progress.count(), 0);
+    assert.equal(await sending.count(), 0);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     assert.equal(await asksBeforeClosing(page), false);
+  });
+
+  it("is stopped from another view, and says there that it was refused", async () => {
+    const page = await openPage(at, "#/train");
+    const sending = page.getByTestId("sending");
+    const begin = async (name, file) => {
+      await page.getByRole("link", { name: "Train", exact: true }).click();
+      if (file !== undefined) await page.getByLabel("Add a sweep").setInputFiles(file);
+      await page.getByLabel("Name", { exact: true }).fill(name);
+      await page.getByRole("button", { name: "Upload and check" }).click();
+      await page.getByRole("link", { name: "Maps", exact: true }).click();
+    };
+    const release = await hold(page, /\/v1\/datasets\/away\?/);
+    await begin("away", at.files.broken);
+    await sending.getByRole("button", { name: "Stop the upload of away" }).click();
+    await sending.waitFor({ state: "detached" });
+    release();
+    await begin("refused");
+    await sending.getByText("not uploaded").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
+    await sending.getByRole("link", { name: "refused" }).click();
+    await page.getByTestId("upload-problem").waitFor();
+    assert.equal(await sending.count(), 0);
   });
 });
 

@@ -137,8 +137,16 @@ describe("a sonographer", () => {
     await page.getByRole("button", { name: "More ways to store" }).click();
     await seen("stores");
     const loop = await download(page, () => page.getByRole("button", { name: /Cine loop, DICOM/ }).click());
-    const frames = "import pydicom, sys; print(pydicom.dcmread(sys.argv[1]).get('NumberOfFrames', 1))";
-    assert.ok(Number(python(frames, loop.path)) > 5, "the loop has hardly a frame");
+    const program = `
+import json, pydicom, shutil, subprocess, sys
+image = pydicom.dcmread(sys.argv[1])
+checked = subprocess.run(["dciodvfy", sys.argv[1]], capture_output=True, text=True).stderr if shutil.which("dciodvfy") else ""
+print(json.dumps([image.get("NumberOfFrames", 1), image.get("ImageComments"), checked.count("Error")]))
+`;
+    const [count, comments, errors] = JSON.parse(python(program, loop.path));
+    assert.ok(count > 5, "the loop has hardly a frame");
+    assert.match(comments, new RegExp(`A  ${diameter_mm.toFixed(1)} mm`));
+    assert.equal(errors, 0);
     assert.deepEqual(await poseOf(page), told);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
@@ -184,7 +192,8 @@ describe("a robotics engineer", () => {
     const count = Number((await panel.getByTestId("path-summary").textContent()).match(/(\d+) poses/)[1]);
     assert.equal(python("import sys; print(sum(1 for _ in open(sys.argv[1])) - 1)", poses.path), String(count));
     await panel.getByRole("button", { name: "Render as a data set" }).click();
-    await panel.getByTestId("path-job").getByText("Done").waitFor({ timeout: MINUTES_MS });
+    await panel.getByTestId("path-job").click();
+    await page.getByTestId("job-state").getByText("succeeded").waitFor({ timeout: MINUTES_MS });
     await seen("rendered");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });

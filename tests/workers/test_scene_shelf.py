@@ -81,6 +81,8 @@ def test_a_folder_keeps_the_promises_of_a_bucket(tmp_path, scene_folder):
     storage.write("scenes/copied.json", json.dumps({"format_version": 1, "sha256": content, "bytes": 1}).encode())
     assert one.names() == {"liver", "copied"}
     assert sha256(one.fetch("copied")) == one.sha256("copied") == content
+    one.replace(scene_folder / "b.ugr", "copied")
+    assert other.fetch("copied").read_bytes() == (scene_folder / "b.ugr").read_bytes()
     assert one.remove("copied")
     assert one.remove("liver")
     assert not other.remove("liver")
@@ -103,6 +105,18 @@ def test_a_published_scene_is_that_of_every_host(new_host, scene_folder, storage
     with pytest.raises(SceneExists, match="already a scene 'liver'"):
         other.shelf.publish(scene_folder / "b.ugr", "liver")
     assert one.store.sha256("liver") == content
+
+
+def test_a_scene_that_one_host_replaces_is_another_on_every_host(new_host, scene_folder):
+    one, other = new_host(), new_host()
+    one.shelf.publish(scene_folder / "a.ugr", "liver")
+    version = other.store.version("liver")
+    one.shelf.replace(scene_folder / "b.ugr", "liver")
+    other.shelf.read()
+    for host in (one, other):
+        assert host.store.path("liver").read_bytes() == (scene_folder / "b.ugr").read_bytes()
+        assert host.store.sha256("liver") == sha256(scene_folder / "b.ugr")
+    assert other.store.version("liver") != version
 
 
 def test_of_many_hosts_that_publish_at_once_one_names_the_scene(new_host, scene_folder):

@@ -202,6 +202,22 @@ class SceneShelf:
         if not (self._place(file, name, sha256) if self.is_near else self._name(file, name, sha256)):
             raise SceneExists(f"there is already a scene {name!r}", field="scene")
 
+    def replace(self, file: Path, name: str) -> None:
+        """Serves a file, which is not changed any more, in the place of the scene that has the name, at once.
+
+        Whoever reads the scene has the one or the other whole. Raises OSError.
+        """
+        if self.is_near:
+            there = self.look_up(name)
+            self.storage.upload(file, self._key(f"{name}{SUFFIX}"))
+            if there is not None and there.sha256 is not None:  # of a folder that was copied from a bucket
+                self.storage.delete(self._entry_key(name))
+        else:
+            sha256, size = file_sha256(file), file.stat().st_size
+            self._upload(file, self._object(sha256))
+            self.storage.write(self._entry_key(name), _entry_text(sha256, size))
+            self._change(name, Placed(self._object(sha256), sha256, size, sha256))
+
     def remove(self, name: str) -> bool:
         there = self.look_up(name)
         if there is not None:
@@ -269,10 +285,7 @@ class SceneShelf:
         there, key, size = self.look_up(name), self._object(sha256), file.stat().st_size
         if there is None:
             self._upload(file, key)
-            created_at = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
-            document = {"format_version": _FORMAT_VERSION, "sha256": sha256, "bytes": size, "created_at": created_at}
-            text = (json.dumps(document) + "\n").encode()
-            if not self.storage.write(self._entry_key(name), text, if_absent=True):
+            if not self.storage.write(self._entry_key(name), _entry_text(sha256, size), if_absent=True):
                 there = self.look_up(name)
                 if there is None:
                     return False
@@ -414,6 +427,13 @@ class SceneShelf:
                 except StorageUnavailable as error:
                     if was is None:
                         _log.warning(f"{error.detail}; scenes that are cached are served meanwhile")
+
+
+def _entry_text(sha256: str, size: int) -> bytes:
+    """What NAME.json says of an object."""
+    created_at = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+    document = {"format_version": _FORMAT_VERSION, "sha256": sha256, "bytes": size, "created_at": created_at}
+    return (json.dumps(document) + "\n").encode()
 
 
 _FIRST_READ_BYTES = 64 * 1024  # most headers with their poses

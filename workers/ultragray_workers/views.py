@@ -1,5 +1,5 @@
 """Work of helper processes, each filling a folder to look at: a dataset's frames, a training's last checkpoint, a
-scene beside held-out frames.
+scene's thumbnail, a scene beside held-out frames.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.geometry.probe import Probe
-from ultragray.rendering.pixels import to_uint8
+from ultragray.geometry.scan_conversion import with_square_pixels
+from ultragray.rendering.pixels import encoded_image, to_uint8
+from ultragray.rendering.settings import Encoding
 from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.helpers import replaced, write_stacks
 from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
@@ -79,6 +81,34 @@ def draw_preview(
     truth = (frame.images / 255.0).astype(np.float32)
     pictures = dict(zip(PREVIEW_PICTURES, (truth, render_sweep(scene, frame, backend="cpu")), strict=True))
     write_stacks(Path(folder), pictures, sweeps.probe)
+
+
+# Work of a helper process: the picture by which a scene is known in lists.
+
+
+THUMBNAIL_NAME = "thumbnail.png"
+THUMBNAIL_SIDE = 128  # scan lines, samples, and pixels of the longer side
+
+
+def draw_thumbnail(folder: str, scene_path: str, **_places: object) -> None:
+    """Write the middle view of the training sweep of a scene, which knows its probe, into `folder`.
+
+    Raises SceneFileInvalid.
+    """
+    import torch
+
+    from ultragray.rendering.frames import render
+    from ultragray.scene.gaussians import GaussianScene
+
+    torch.set_num_threads(1)
+    scene = GaussianScene.load(scene_path)
+    probe = scene.info.probe_or(None)
+    pose = scene.training_poses[len(scene.training_poses) // 2]
+    side = THUMBNAIL_SIDE
+    with torch.no_grad():
+        frames = render(scene, probe, pose, height=side, width=side, outputs=("bmode",), backend="cpu")
+    picture = with_square_pixels(frames["bmode"][0].numpy(), probe, side)
+    (Path(folder) / THUMBNAIL_NAME).write_bytes(encoded_image(to_uint8(picture), Encoding.PNG))
 
 
 # Work of a helper process: comparing a scene with the held-out frames of the dataset that it was trained from.

@@ -180,6 +180,45 @@ class UnloadSceneResponse(_message.Message):
     loaded_processes: int
     def __init__(self, scene: _Optional[str] = ..., loaded_processes: _Optional[int] = ...) -> None: ...
 
+class LabelSceneRequest(_message.Message):
+    __slots__ = ("scene", "frames", "probe", "label_map", "registration", "into", "replace", "private", "label_names", "within_mm")
+    class LabelNamesEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: int
+        value: str
+        def __init__(self, key: _Optional[int] = ..., value: _Optional[str] = ...) -> None: ...
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_MAP_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    INTO_FIELD_NUMBER: _ClassVar[int]
+    REPLACE_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_NAMES_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    frames: _containers.RepeatedCompositeFieldContainer[PaintedFrame]
+    probe: _geometry_pb2.Probe
+    label_map: bytes
+    registration: str
+    into: str
+    replace: bool
+    private: bool
+    label_names: _containers.ScalarMap[int, str]
+    within_mm: float
+    def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[PaintedFrame, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., label_map: _Optional[bytes] = ..., registration: _Optional[str] = ..., into: _Optional[str] = ..., replace: _Optional[bool] = ..., private: _Optional[bool] = ..., label_names: _Optional[_Mapping[int, str]] = ..., within_mm: _Optional[float] = ...) -> None: ...
+
+class PaintedFrame(_message.Message):
+    __slots__ = ("pose", "labels")
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
+    pose: _geometry_pb2.Pose
+    labels: bytes
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., labels: _Optional[bytes] = ...) -> None: ...
+
 class Error(_message.Message):
     __slots__ = ("reason", "field", "detail")
     REASON_FIELD_NUMBER: _ClassVar[int]

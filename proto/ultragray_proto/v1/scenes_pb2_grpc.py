@@ -54,6 +54,11 @@ class SceneServiceStub:
                 request_serializer=ultragray_dot_v1_dot_scenes__pb2.UnloadSceneRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_scenes__pb2.UnloadSceneResponse.FromString,
                 _registered_method=True)
+        self.LabelScene = channel.unary_unary(
+                '/ultragray.v1.SceneService/LabelScene',
+                request_serializer=ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
+                _registered_method=True)
 
 
 class SceneServiceServicer:
@@ -88,6 +93,14 @@ class SceneServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def LabelScene(self, request, context):
+        """Labels the Gaussians of a scene by frames that somebody painted on, or by a label map. The scene stays as it is, unless
+        it is the one to be replaced. SCENE_NOT_FOUND, SCENE_EXISTS, SCENE_READ_ONLY, INVALID_ARGUMENT.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_SceneServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -110,6 +123,11 @@ def add_SceneServiceServicer_to_server(servicer, server):
                     servicer.UnloadScene,
                     request_deserializer=ultragray_dot_v1_dot_scenes__pb2.UnloadSceneRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_scenes__pb2.UnloadSceneResponse.SerializeToString,
+            ),
+            'LabelScene': grpc.unary_unary_rpc_method_handler(
+                    servicer.LabelScene,
+                    request_deserializer=ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_scenes__pb2.Scene.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -220,6 +238,33 @@ class SceneService:
             '/ultragray.v1.SceneService/UnloadScene',
             ultragray_dot_v1_dot_scenes__pb2.UnloadSceneRequest.SerializeToString,
             ultragray_dot_v1_dot_scenes__pb2.UnloadSceneResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LabelScene(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.SceneService/LabelScene',
+            ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.SerializeToString,
+            ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
             options,
             channel_credentials,
             insecure,

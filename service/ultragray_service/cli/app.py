@@ -48,6 +48,7 @@ _COMMANDS = {  # by the panels of the help
         "export": (".scenes:export", "Write a scene as PLY or as a checkpoint of the released code."),
         "localize": (".register:localize", "Find the pose of a real frame in a scene."),
         "calibrate": (".register:calibrate_app", "Register a robot or tracker to a scene."),
+        "label": (".labels:label", "Label the Gaussians of a scene by a NIfTI map or by painted frames."),
         "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
         "slicer": (".scenes:slicer", "Write a scene file of 3D Slicer that shows a served scene live."),
         "import": (".scenes:import_scene", "Turn a PLY file or a released checkpoint into a scene file."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import tempfile
@@ -17,14 +18,17 @@ import numpy as np
 from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions, find_source
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.exchange.label_maps import parse_names, read_label_map, read_painted
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.pixels import png_file
 from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
 from ultragray.scene.info import read_header
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
+from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
 from ultragray_service.cli.terminal import (
@@ -204,6 +208,52 @@ def download_scene(
     with transferred(f"downloading {name}") as begin:
         size = connection.download(route("scenes", name, "file"), path, begin)
     tell(f"wrote {path}: {size:,} bytes", {"output": str(path), "bytes": size}, as_json=json)
+
+
+@scenes_app.command(
+    "label",
+    epilog=examples(
+        "ultragray scenes label liver --into liver-labelled --map segmentation.nii.gz --names 1=vessel,2=tumour",
+        "ultragray scenes label liver --into liver-labelled --frames painted.npz --names 1=vessel --replace",
+    ),
+)
+@with_connection
+def label_scene(
+    connection: Connection,
+    name: NameArgument,
+    into: Annotated[str, option("Name of the scene to make.", shown=False)],
+    label_map: MapOption = None,
+    frames: FramesOption = None,
+    names: NamesOption = "",
+    within_mm: WithinOption = 4.0,
+    registration: Annotated[
+        str | None, option("Name of the registration that leads the map, or poses, into the scene.", shown=False)
+    ] = None,
+    replace: Annotated[
+        bool, option("INTO may be there, with the same Gaussians: it gets the labels.", "--replace")
+    ] = False,
+    private: Annotated[bool, option("Others do not see the scene that is made.", "--private")] = False,
+    json: Json = False,
+) -> None:
+    """Have the service label the Gaussians of a scene, as another scene."""
+    check_source(label_map, frames)
+    asked = {"into": into, "replace": replace, "private": private, "within_mm": within_mm, "registration": registration}
+    asked["label_names"] = parse_names(names)
+    if label_map is not None:
+        read_label_map(label_map)  # what is none is refused before it travels
+        suffix, asked["label_map"] = ":label-by-map", _base64(label_map.read_bytes())
+    elif frames is not None:
+        painted, suffix = read_painted(frames), ":label"
+        asked["frames"] = [
+            {"pose": _pose(pose), "labels": _base64(png_file(labels))}
+            for pose, labels in zip(painted.poses, painted.labels, strict=True)
+        ]
+    scene = connection.json("POST", route("scenes", name, suffix=suffix), asked)
+    tell(f"labelled {name} as {into}: {', '.join(scene['label_names'].values())}", scene, as_json=json)
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
 
 
 _scenes.add_delete("Delete a scene that was uploaded or trained there; scenes of the data folder stay.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ from ultragray.phantom.demo import simulated_sha256
 from ultragray.scene.info import SceneHeader, read_header
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits, Slots
-from ultragray_service.access.owners import Claim, Owners
+from ultragray_service.access.owners import Claim, Owners, may_change
 from ultragray_service.access.principals import GB, acting
 from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
-from ultragray_service.errors import LimitReached, SceneReadOnly
+from ultragray_service.errors import LimitReached, PermissionDenied, SceneReadOnly
 from ultragray_service.settings import Settings
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
@@ -283,6 +283,7 @@ class DatasetUpload:
 
 SCENE_CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4
+Make = Callable[[Path, Path | None], Awaitable[None]]  # writes a scene file, in place of another one
 
 
 class SceneImports:
@@ -297,6 +298,48 @@ class SceneImports:
         """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end."""
         check_scene_name(name)
         await self._require_free(name)
+        async with self._room(name) as (received, max_bytes):
+            await self._write(received, blocks, max_bytes)
+            yield received
+
+    async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
+        """Checks a file that was received and serves it as the scene `name`; cancelling ends the check."""
+        check = self._means.checks.run(
+            check_scene_file,
+            {"path": str(received)},
+            what="checking the scene",
+            timeout_s=SCENE_CHECK_TIMEOUT_S,
+            killed=SceneFileInvalid,
+        )
+        return await self._named(received, name, check, private=private)
+
+    async def make(self, name: str, make: Make, *, replace: bool, private: bool) -> SceneHeader:
+        """Serves a file that `make` writes as the scene `name`; cancelling ends the making.
+
+        With `replace` it takes the place of the scene of that name where there is one, which must be the caller's, and
+        keeps its owner. Raises SceneExists, SceneReadOnly, PermissionDenied, LimitReached, QueueFull.
+        """
+        check_scene_name(name)
+        before = await asyncio.to_thread(self._replaceable, name) if replace else None
+        if before is None:
+            await self._require_free(name)
+        async with self._room(name) as (made, max_bytes):
+
+            async def making() -> None:
+                await make(made, None if before is None else await asyncio.to_thread(self._store.path, name))
+                if made.stat().st_size > max_bytes:
+                    raise UploadTooLarge(f"a scene file may have at most {max_bytes} bytes", field="body")
+
+            if before is None:
+                return await self._named(made, name, making(), private=private)
+            await making()
+            header = await asyncio.to_thread(read_header, made)
+            await to_its_end(partial(copy_context().run, self._replace, made, name, before))
+            return header
+
+    @asynccontextmanager
+    async def _room(self, name: str) -> AsyncIterator[tuple[Path, int]]:
+        """A place for the file of a scene, and the bytes that it may have; removed at the end of the body."""
         most = self._means.settings.max_dataset_bytes
         with self._slots.one():
             claim = contextlib.ExitStack()
@@ -304,32 +347,42 @@ class SceneImports:
                 async with self._means.quotas.room(self._means.jobs, most) as max_bytes:
                     with storage_full("the scene"):
                         folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
-                        received = folder / f"{name}{SUFFIX}"
-                        await self._write(received, blocks, max_bytes)
-                        yield received
+                        yield folder / f"{name}{SUFFIX}", max_bytes
             finally:
                 await to_its_end(claim.close)
 
-    async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
-        """Checks a file that was received and serves it as the scene `name`; cancelling ends the check."""
-        await self._require_free(name)
-        claim = Claim(self._means.owners, Kind.SCENE, name, received.parent.name, private=private)
-        async with claim.held():
-            if not await claim.take(partial(self._is_there, name)):
-                await self._require_free(name)
-                raise SceneExists(f"another import makes a scene {name!r}: choose another name", field="scene")
-            await self._means.checks.run(
-                check_scene_file,
-                {"path": str(received)},
-                what="checking the scene",
-                timeout_s=SCENE_CHECK_TIMEOUT_S,
-                killed=SceneFileInvalid,
-            )
-            header = await asyncio.to_thread(read_header, received)
+    async def _named(self, file: Path, name: str, work: Coroutine[Any, Any, None], *, private: bool) -> SceneHeader:
+        """Claims a name, does the work that the file still needs, and serves it."""
+        claim = Claim(self._means.owners, Kind.SCENE, name, file.parent.name, private=private)
+        with contextlib.closing(work):
             await self._require_free(name)
-            await claim.spread()
-            await to_its_end(lambda: self._publish(received, name, claim))
+            async with claim.held():
+                if not await claim.take(partial(self._is_there, name)):
+                    await self._require_free(name)
+                    raise SceneExists(f"another import makes a scene {name!r}: choose another name", field="scene")
+                await work
+                header = await asyncio.to_thread(read_header, file)
+                await self._require_free(name)
+                await claim.spread()
+                await to_its_end(lambda: self._publish(file, name, claim))
         return header
+
+    def _replaceable(self, name: str) -> str | None:
+        """The hash of a scene that the caller may replace; None where there is none."""
+        if (shelf := self._store.shelf_of(name)) is None:
+            return None
+        if shelf is not self._shelf:
+            raise _read_only(name)
+        if not may_change(acting(), self._means.owners.known(Kind.SCENE, name)):
+            raise PermissionDenied(f"the scene {name!r} is not yours: choose another name", field="scene")
+        return self._store.sha256(name)
+
+    def _replace(self, made: Path, name: str, before: str) -> None:
+        if self._replaceable(name) != before:
+            raise SceneExists(f"the scene {name!r} has become another one meanwhile: ask again", field="scene")
+        sync(made)
+        self._shelf.replace(made, name)
+        self._store.forget(name)
 
     async def delete(self, name: str) -> None:
         await asyncio.to_thread(self._store.require, name)
@@ -380,11 +433,15 @@ class SceneImports:
         check_scene_name(name)
         self._store.require(name)
         if self._store.shelf_of(name) is not self._shelf:
-            raise SceneReadOnly(
-                f"the scene {name!r} lies in the data folder of the service: only scenes that were imported, or that "
-                "jobs made, can be deleted",
-                field="scene",
-            )
+            raise _read_only(name)
         if not self._shelf.remove(name):
             raise SceneNotFound(f"there is no scene {name!r} any more", field="scene")
         self._store.forget(name)
+
+
+def _read_only(name: str) -> SceneReadOnly:
+    return SceneReadOnly(
+        f"the scene {name!r} lies in the data folder of the service: only scenes that were imported, or that were made "
+        "there, can be changed or deleted",
+        field="scene",
+    )

@@ -25,6 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
 from ultragray import __version__
+from ultragray.contract import to_dict
 from ultragray.errors import UltragrayError
 from ultragray.geometry.probe import Probe
 from ultragray.learn.training.config import PRESETS, TrainingConfig
@@ -36,6 +37,8 @@ from ultragray_service.http.bodies import (
     SPECIFICATIONS,
     AssessBody,
     JobBody,
+    LabelBody,
+    LabelMapBody,
     LocalizeBody,
     RegistrationBody,
     RenderBody,
@@ -176,6 +179,7 @@ the frame of the sweep that the scene was trained from. Errors are `application/
 ROLE = "x-role"  # that it needs
 OWNED = "x-owned"  # whether what it names must be the caller's own, but for admins
 PRESETS_SET = "x-presets"  # the training settings that each preset sets otherwise
+NAMED = "x-named"  # the members of a family that have names
 
 _SECURITY_SCHEMES = {
     "Bearer": {"type": "http", "scheme": "bearer"},
@@ -206,6 +210,8 @@ _READ: tuple[Any, ...] = (
     SliceSettings,
     AssessBody,
     LocalizeBody,
+    LabelBody,
+    LabelMapBody,
     RegistrationBody,
     StreamMessage,
     JobBody,
@@ -294,6 +300,7 @@ class _Application(FastAPI):
             schemas.update({cls.__name__: schema for (cls, _), schema in found.items() if "$ref" not in schema})
             schemas.update(extra["$defs"])
             schemas[TrainingConfig.__name__][PRESETS_SET] = PRESETS
+            schemas[Probe.__name__][NAMED] = {name: to_dict(probe) for name, probe in Probe.named.items()}
             for method, path, operation in HttpRules().routes():
                 entry = document["paths"].get(path, {}).get(method.lower())
                 if entry is not None and operation.role is not None:

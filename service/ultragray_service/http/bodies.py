@@ -27,6 +27,7 @@ from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
+from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
@@ -57,6 +58,7 @@ class Apart:
     check_count: Callable[[int], None] = lambda count: None
     max_bytes: float = math.inf  # of the whole body
     max_values: float = MAX_VALUES
+    max_characters: int = INLINE_BYTES  # of the texts of an element
 
 
 async def read_large(body: bytes, cls: type[T], apart: Apart | None) -> T:
@@ -109,7 +111,7 @@ def _small(value: Any, cls: type[T]) -> T:
 
 def _element(apart: Apart, index: int, value: Any) -> Any:
     path = f"{apart.key}[{index}]"
-    if not _is_small(value, _ELEMENT_VALUES):
+    if not _is_small(value, _ELEMENT_VALUES, apart.max_characters):
         raise apart.error(f"{path} must hold at most {_ELEMENT_VALUES} values", field=path)
     try:
         return read_json(json.dumps(value), apart.element)
@@ -117,9 +119,9 @@ def _element(apart: Apart, index: int, value: Any) -> Any:
         raise error_under(path, error, apart.error) from None
 
 
-def _is_small(value: Any, most: int) -> bool:
+def _is_small(value: Any, most: int, most_characters: int = INLINE_BYTES) -> bool:
     waiting, values, characters = [value], 0, 0
-    while waiting and values <= most and characters <= INLINE_BYTES:
+    while waiting and values <= most and characters <= most_characters:
         one = waiting.pop()
         values += 1
         if isinstance(one, str):
@@ -128,7 +130,7 @@ def _is_small(value: Any, most: int) -> bool:
             waiting += (*one, *one.values())
         elif isinstance(one, list):
             waiting += one
-    return not waiting and values <= most and characters <= INLINE_BYTES
+    return not waiting and values <= most and characters <= most_characters
 
 
 @cache
@@ -210,6 +212,45 @@ class LocalizeBody(LocalizationSettings):
 
 
 LARGE_IMAGE = Apart("image", str)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintedFrame(Contract):
+    """A frame that somebody painted on."""
+
+    pose: Pose = described("Where the frame was rendered, or taken.", error=InvalidPose)
+    labels: str = described(
+        "A grey PNG file of 8 bits in base64, rows along depth, columns across scan lines, not scan-converted: the "
+        "label of each pixel, 0: no label, 255: not painted."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelBody(LabelTarget):
+    """Painted frames, in the order in which they were painted."""
+
+    frames: list[PaintedFrame] = described("At least one; a later one counts more where it contradicts.", factory=list)
+    probe: Probe | None = described("Of the frames. Default: the scene's own.", None)
+    registration: str | None = registration_field()
+
+
+PAINTED_FRAMES = Apart(
+    "frames", list, PaintedFrame, max_characters=2**23, check_count=check_painted_count, max_bytes=2**27
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelMapBody(LabelTarget):
+    """A label map in three dimensions."""
+
+    label_map: str = described("A NIfTI-1 file (.nii, .nii.gz) in base64, of whole numbers, 0: no label.")
+    registration: str | None = described(
+        "Name of the registration whose base_to_scene leads the map, in mm, into the scene. Default: it lies there.",
+        None,
+    )
+
+
+LABEL_MAP = Apart("label_map", str)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from ultragray.contract import blamed, under
 from ultragray.errors import InvalidArgument, InvalidPose, UltragrayError
 from ultragray.geometry.pose import check_poses, pose_from_position_quaternion
-from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.settings import RenderSettings, Resolved, settings_used
 from ultragray.rendering.volumes import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
@@ -24,6 +24,14 @@ from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult
 
 _LENGTH_DELIMITED = 2  # the wire type of bytes
+
+
+@dataclass(frozen=True)
+class OfProbe:
+    """The part of a request that says whose poses it has, and in which frame."""
+
+    probe: Probe | None = None
+    registration: str | None = None
 
 
 def read(message: Any, cls: Any, **others: Any) -> Any:

@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -18,7 +17,7 @@ from google.protobuf.message import DecodeError
 
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.volumes import SliceSettings
 from ultragray_proto.codec import to_message
@@ -36,7 +35,15 @@ from ultragray_service.core.streams import (
     unreadable,
 )
 from ultragray_service.errors import Refusal
-from ultragray_service.rpc.messages import read, read_pose, read_settings, read_word, serialized_frame, slice_message
+from ultragray_service.rpc.messages import (
+    OfProbe,
+    read,
+    read_pose,
+    read_settings,
+    read_word,
+    serialized_frame,
+    slice_message,
+)
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
 from ultragray_service.views.poses import locate, sought_frame
@@ -178,14 +185,6 @@ _RETRY_S = 0.02
 _STREAM_NAME = "x-ultragray-stream-name"  # metadata
 
 
-@dataclass(frozen=True)
-class _OfProbe:
-    """The part of a request that says whose poses it has, and in which frame."""
-
-    probe: Probe | None = None
-    registration: str | None = None
-
-
 class RenderService:
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -243,7 +242,7 @@ class RenderService:
         self, request: rendering_pb2.AssessPosesRequest, context: Context
     ) -> rendering_pb2.AssessPosesResponse:
         check_pose_count(len(request.poses), self._service.planner.max_poses)
-        whose = read(request, _OfProbe)
+        whose = read(request, OfProbe)
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
         found = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
         return to_message(found, rendering_pb2.AssessPosesResponse)

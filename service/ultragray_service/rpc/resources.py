@@ -23,10 +23,11 @@ from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2
 from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_service.access.principals import Me, me
 from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
+from ultragray_service.core.labelling import LabelTarget
 from ultragray_service.core.registrations import NamedRegistration
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
-from ultragray_service.rpc.messages import job_message, read, read_specification, read_word
+from ultragray_service.rpc.messages import OfProbe, job_message, read, read_pose, read_specification, read_word
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.store import JobStore
@@ -135,10 +136,24 @@ async def _who_am_i(service: Service, request: Any) -> Me:
     return me(service.guard.asks)
 
 
+async def _label_scene(service: Service, request: Any) -> Any:
+    target: LabelTarget = read(request, LabelTarget)
+    whose = read(request, OfProbe)
+    if request.label_map:
+        if request.frames:
+            raise InvalidArgument("either frames or label_map must be given, not both", field="label_map")
+        return await service.labels.by_map(request.scene, target, request.label_map, whose.registration)
+    frames = [
+        (read_pose(frame.pose, f"frames[{index}].pose"), frame.labels) for index, frame in enumerate(request.frames)
+    ]
+    return await service.labels.by_frames(request.scene, target, frames, whose.probe, whose.registration)
+
+
 CALLS: Mapping[str, Call] = {
     "SceneService.ListScenes": lambda service, request: service.scenes.page(_size(request), request.page_token),
     "SceneService.GetScene": lambda service, request: service.scenes.get(request.scene),
     "SceneService.LoadScene": lambda service, request: service.scenes.load(request.scene),
+    "SceneService.LabelScene": _label_scene,
     "SceneService.UnloadScene": lambda service, request: service.scenes.unload(request.scene),
     "DatasetService.ListDatasets": lambda service, request: service.datasets.page(_size(request), request.page_token),
     "DatasetService.GetDataset": lambda service, request: service.datasets.get(request.dataset),

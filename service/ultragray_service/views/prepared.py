@@ -39,7 +39,17 @@ from ultragray_workers.helpers import read_picture
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.views import FRAMES_NAME, PICTURES, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
+from ultragray_workers.views import (
+    FRAMES_NAME,
+    PICTURES,
+    POSES_NAME,
+    PREVIEW_PICTURES,
+    THUMBNAIL_NAME,
+    compare,
+    draw_preview,
+    draw_thumbnail,
+    lay_out,
+)
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32
@@ -62,7 +72,7 @@ class Prepared:
 
     A subclass says in which folder of the artifact folder its own lie, what its helper process does, in the words of
     errors, and which function fills a folder: it takes `folder`, `artifact_folder`, `storage` where hosts share one,
-    and what the kind asks of it. Keys end with the SHA-256 of the dataset that the pictures are of. The folders that
+    and what the kind asks of it. Keys end with the SHA-256 of what the pictures are of. The folders that
     were asked for last are kept: KEPT_FOLDERS, and beside the newest no more bytes than a dataset may have. All methods
     belong to one event loop.
     """
@@ -70,6 +80,7 @@ class Prepared:
     name: ClassVar[str]
     what: ClassVar[str]
     fill: ClassVar[Callable[..., None]]  # a staticmethod
+    most_factor: ClassVar[int] = 1  # KEPT_FOLDERS times this are kept
 
     def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
         self._origins: dict[str, str | int] = {"artifact_folder": str(settings.working_folder)}
@@ -226,7 +237,7 @@ class Prepared:
         held_bytes = 0
         for count, folder in enumerate(others, 2):
             held_bytes += _size_bytes(folder)
-            if count > KEPT_FOLDERS or held_bytes > self._kept_bytes:
+            if count > KEPT_FOLDERS * self.most_factor or held_bytes > self._kept_bytes:
                 remove_whole(folder, _PREFIX)
 
     def _kept(self) -> list[Path]:
@@ -370,6 +381,32 @@ def _curve_of(journal: str | None) -> list[CurvePoint]:
         )
         for group in groups
     ]
+
+
+class Thumbnails(Prepared):
+    """A frame from the middle of each scene's training sweep, by the content of the scene."""
+
+    name, what, fill = "thumbnails", "drawing the scene", staticmethod(draw_thumbnail)
+    most_factor = 32  # they are small, and lists show many
+
+    def __init__(
+        self, scenes: SceneStore, catalog: SceneCatalog, settings: Settings, processes: HelperProcesses
+    ) -> None:
+        super().__init__(settings, processes)
+        self._scenes, self._catalog = scenes, catalog
+
+    async def key(self, scene: str) -> str:
+        """Raises SceneNotFound, SceneFileInvalid, ArtifactNotFound where it does not know where it was trained."""
+        header = await self._catalog.header(scene)
+        if header.info.probe is None or not len(header.training_poses):
+            raise ArtifactNotFound(f"the scene {scene!r} knows no view of its own", field="scene")
+        return await in_own_thread(lambda: self._scenes.sha256(scene))
+
+    async def png(self, scene: str, key: str) -> bytes:
+        """Raises as `Prepared.path`."""
+        path = await asyncio.to_thread(self._scenes.path, scene)
+        folder = await self.path(key, scene_path=str(path))
+        return await asyncio.to_thread((folder / THUMBNAIL_NAME).read_bytes)
 
 
 _FORMAT = 4  # of what is kept of a comparison

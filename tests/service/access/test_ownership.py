@@ -1,15 +1,18 @@
 """What is private is not there for others, at any door; what is not can be read by all, and changed by its owner."""
 
+import base64
 import json
 import time
 
+import cv2
 import grpc
+import numpy as np
 import pytest
 import sqlalchemy as sa
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.owners import Kind
@@ -67,6 +70,8 @@ BODIES = {
     "slice": {"origin_mm": [0, 0, 0], "size_mm": [1, 1]},
     "scene}:localize": {"image": "", "start": POSE},
     "scene}:assess": {"poses": [POSE]},
+    "scene}:label": {"into": "mine", "frames": [{"pose": POSE, "labels": ""}]},
+    "scene}:label-by-map": {"into": "mine", "label_map": ""},
 }
 NAMING = [
     ("POST", "/v1/jobs", {"kind": "train", "specification": {"dataset": "{name}", "scene": "mine"}}),
@@ -170,6 +175,7 @@ def test_private_things_answer_at_every_method_as_if_they_were_not_there(keyed, 
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
     plane = {"origin_mm": geometry_pb2.Position(), "size_mm": rendering_pb2.SliceSize(width=1, height=1)}
     given = {"pose": pose, "start": pose, "poses": [pose], "slice": rendering_pb2.SliceSettings(**plane)}
+    given |= {"into": "mine", "frames": [scenes_pb2.PaintedFrame(pose=pose)]}
 
     def ask(channel, name, job):
         things = {**given, **dict.fromkeys([kind.value for kind in PRIVATE], name), "job": job}
@@ -372,3 +378,23 @@ def test_admins_pause_drain_and_resume_over_http(keyed, database):
             ("admin", f"worker.{wish}", "absent", "WORKER_NOT_FOUND"),
         }
         wait_until(lambda expected=expected: expected <= audited())
+
+
+def test_labels_are_put_into_a_scene_by_its_owner_alone(keyed, scene_bytes):
+    assert keyed.http("alice", "PUT", "/v1/scenes/labelled", content=scene_bytes).status_code == 201
+    labels = cv2.imencode(".png", np.ones((32, 32), np.uint8))[1].tobytes()
+    frame = {"pose": {"matrix": MATRIX}, "labels": base64.b64encode(labels).decode()}
+    body = {"into": "labelled", "replace": True, "frames": [frame], "label_names": {"1": "tissue"}}
+    refused = keyed.http("bob", "POST", "/v1/scenes/labelled:label", json=body)
+    assert (refused.status_code, refused.json()["reason"], refused.json()["field"]) == (
+        403,
+        "PERMISSION_DENIED",
+        "scene",
+    )
+    assert keyed.http("bob", "GET", "/v1/scenes/labelled").json()["label_names"] == {}
+    answer = keyed.http("alice", "POST", "/v1/scenes/labelled:label", json=body)
+    assert (answer.status_code, answer.json()["owner"]) == (201, "alice"), answer.text
+    assert keyed.http("bob", "GET", "/v1/scenes/labelled").json()["label_names"] == {"1": "tissue"}
+    own = keyed.http("bob", "POST", "/v1/scenes/labelled:label", json={**body, "into": "bobs", "private": True})
+    assert (own.status_code, own.json()["owner"], own.json()["private"]) == (201, "bob", True), own.text
+    assert keyed.http("alice", "GET", "/v1/scenes/bobs").status_code == 404

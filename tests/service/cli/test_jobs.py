@@ -69,7 +69,8 @@ def test_poses_of_a_file_become_an_archive(server, client, tmp_path):
     np.save(tmp_path / "poses.npy", poses)
     arguments = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 16, "--format", "tar", "--wait")
     job = done(server, "submit", "render", "demo", *arguments).splitlines()[0]
-    [name] = client.get(f"/v1/jobs/{job}").json()["artifacts"]
+    *examples, name = client.get(f"/v1/jobs/{job}").json()["artifacts"]
+    assert examples == [f"example_{place:05d}.png" for place in range(3)]
     done(server, "download", job, name, "-o", tmp_path / name)
     with tarfile.open(tmp_path / name) as archive:
         pictures = [entry for entry in archive.getnames() if entry.endswith(".png")]

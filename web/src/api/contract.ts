@@ -5,7 +5,7 @@
 
 import { postJson, type Schemas } from "./client";
 import { defaultsOf, type Described } from "./described";
-import { outputs, settings } from "./generated/contract";
+import { namedProbes, outputs, settings } from "./generated/contract";
 
 export type StreamSettings = Omit<Schemas["RenderSettings"], "encoding">;
 export type FrameHeader = Schemas["FrameMessage"];
@@ -48,6 +48,9 @@ export type ImagePlane = Schemas["ImagePlane"];
 export const PROBE_KINDS: ReadonlyMap<string, Described> = new Map(
   (settings.properties?.probe?.oneOf ?? []).map((one) => [String(one.properties?.kind?.const), one]),
 );
+
+/** Probes as makers call them, such as L12-4. */
+export const NAMED_PROBES = namedProbes as Record<string, Probe>;
 
 /** A probe of that kind which looks so deep. */
 export function exampleProbe(kind: string, depth_mm: number): Probe {

@@ -1,6 +1,6 @@
 /** Scenes and registrations: what there is, what they say about themselves, their files, their comparison with held-out frames. */
 
-import { address, getJson, postJson, remove, request, type Schemas } from "./client";
+import { address, getJson, postJson, remove, request, type Schemas, ServiceError } from "./client";
 import { putFile, type Told } from "./datasets";
 import { FIELDS, Gaussians } from "./gaussians";
 import type { paths } from "./generated/schema";
@@ -65,6 +65,16 @@ export function importScene(
 export const deleteScene = (scene: string): Promise<void> => remove("/v1/scenes/{scene}", { scene });
 
 export const sceneFilePath = (scene: string): string => address("/v1/scenes/{scene}/file", { scene });
+
+/** A small PNG of the scene; null: it knows no view of its own. */
+export async function thumbnailOf(scene: string): Promise<Blob | null> {
+  try {
+    return await (await request(address("/v1/scenes/{scene}/thumbnail.png", { scene }))).blob();
+  } catch (error) {
+    if (error instanceof ServiceError && error.reason === "ARTIFACT_NOT_FOUND") return null;
+    throw error;
+  }
+}
 
 export type Comparison = Schemas["Comparison"];
 export type ComparedFrame = Schemas["ComparedFrame"];

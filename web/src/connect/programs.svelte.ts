@@ -1,12 +1,14 @@
-/** What other programs do with a scene: the streams that they have open, and the jobs that render a path for them. */
+/** What other programs do with a scene: the streams that they have open, and the data sets and films that a path becomes. */
 
-import { explain, untilAnswered } from "../api/client";
-import { cancelJob, followJob, isFinal, type Job, startJob } from "../api/jobs";
+import { untilAnswered } from "../api/client";
+import { startJob } from "../api/jobs";
+import { renderPicture } from "../api/rendering";
 import { listStreams, PAGE, PAGE_NAME, type StreamSummary } from "../api/stream";
 import type { Pose } from "../geometry/pose";
 import { service } from "../page/service.svelte";
 import type { Session } from "../session/session.svelte";
 import { base64, polled } from "../shared/asking.svelte";
+import { videoOf } from "../shared/video";
 
 const EVERY_MS = 1000;
 
@@ -26,57 +28,37 @@ export class OpenStreams {
   }
 }
 
-/** A path that becomes a data set: a job of the service, from its start to its files. */
-export class Rendering {
-  job = $state.raw<Job | null>(null);
-  problem = $state<string | null>(null);
-  #sending = $state(false);
-  readonly isUnderWay = $derived(this.#sending || (this.job !== null && !isFinal(this.job)));
-  #stopped = new AbortController();
-
-  /** Renders poses with the image settings of a session. */
-  async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
-    this.problem = null;
-    this.#sending = true;
-    const specification = { scene: session.name, poses: written(poses), format, ...session.settings(["bmode"]) };
-    try {
-      this.job = await startJob("render", specification, false);
-      this.#sending = false;
-      await this.#follow(this.job.id);
-    } catch (error) {
-      if (!this.#stopped.signal.aborted) this.problem = explain(error);
-    } finally {
-      this.#sending = false;
-    }
-  }
-
-  async cancel(): Promise<void> {
-    try {
-      if (this.job !== null) await cancelJob(this.job.id);
-    } catch (error) {
-      this.problem = explain(error);
-    }
-  }
-
-  /** Leaves the job to the service. */
-  leave(): void {
-    this.#stopped.abort();
-  }
-
-  async #follow(id: string): Promise<void> {
-    let last: string | null = null;
-    const told = {
-      job: (job: Job) => (this.job = job),
-      log: () => undefined,
-      event: (event: string) => (last = event),
-    };
-    const { signal } = this.#stopped;
-    while (this.isUnderWay && !signal.aborted)
-      await untilAnswered(() => followJob(id, last, told, signal), () => undefined, signal);
-  }
+/** Has the service render poses with the image settings of a session; the id of the job. */
+export async function renderPath(session: Session, poses: readonly Pose[], format: string): Promise<string> {
+  const written = base64(new Uint8Array(new Float64Array(poses.flat()).buffer)); // row by row, the low byte first
+  return (await startJob("render", { scene: session.name, poses: written, format, ...session.settings(["bmode"]) }, false)).id;
 }
 
-/** Row by row as float64, the low byte first. */
-function written(poses: readonly Pose[]): string {
-  return base64(new Uint8Array(new Float64Array(poses.flat()).buffer));
+const MOST_FILMED = 1800; // of longer paths an even selection
+const FILMED_PER_SECOND = 30;
+
+/** Poses as a film, with the image settings of a session; `told` hears how many frames are rendered. Throws ServiceError, Unreachable. */
+export async function filmOf(
+  session: Session,
+  poses: readonly Pose[],
+  told: (done: number, all: number) => void,
+  signal: AbortSignal,
+): Promise<{ blob: Blob; suffix: string }> {
+  const count = Math.min(MOST_FILMED, poses.length);
+  const settings = session.settings(["bmode"]);
+  const frames: Blob[] = [];
+  for (let index = 0; index < count; index++) {
+    const pose = poses[Math.round((index * (poses.length - 1)) / Math.max(1, count - 1))]!;
+    frames.push((await untilAnswered(() => renderPicture(session.name, pose, settings, signal), () => undefined, signal)).picture);
+    told(index + 1, count);
+  }
+  const canvas = document.createElement("canvas");
+  const draw = async (index: number): Promise<void> => {
+    const picture = await createImageBitmap(frames[index]!);
+    // encoders want even sides
+    if (index === 0) [canvas.width, canvas.height] = [2 * Math.ceil(picture.width / 2), 2 * Math.ceil(picture.height / 2)];
+    canvas.getContext("2d")!.drawImage(picture, 0, 0);
+    picture.close();
+  };
+  return videoOf(canvas, count, { draw, perSecond: FILMED_PER_SECOND, told: () => undefined });
 }

@@ -53,9 +53,10 @@ const PROGRAMS = { curl, python, javascript, csharp, grpc, websocket, igtl, ros 
 export type Language = keyof typeof PROGRAMS;
 export const LANGUAGES = Object.keys(PROGRAMS) as Language[];
 
-/** The program; null where the service has no such door. */
-export function snippet(language: Language, target: Target, asked: Asked): string | null {
-  return PROGRAMS[language](target, asked);
+/** The program, or those that run beside each other; null where the service has no such door. */
+export function snippets(language: Language, target: Target, asked: Asked): string[] | null {
+  const found = PROGRAMS[language](target, asked);
+  return found === null ? null : [found].flat();
 }
 
 function curl(target: Target, asked: Asked): string {
@@ -228,8 +229,8 @@ client.stop()
 `;
 }
 
-/** The command of the node, and the pose of now for it. */
-function ros(target: Target, { pose, settings }: Asked): string {
+/** The command of the node, and beside it the pose of now for it. */
+function ros(target: Target, { pose, settings }: Asked): string[] {
   const [x, y, z] = position(pose).map((value) => short(value / 1000));
   const [w, i, j, k] = quaternion(pose).map(short);
   const place = `position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
@@ -243,9 +244,16 @@ function ros(target: Target, { pose, settings }: Asked): string {
   for (const [name, value] of Object.entries(display ?? {})) given[`display.${name}`] = value;
   const parameters = Object.entries(given)
     .map(([name, value]) => ` \\\n  -p '${name}:=${parameter(name, value).replaceAll("'", "'\\''")}'`);
-  return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: ${frame}}, pose: {${place}}}'
-${target.key_required ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
+  const key = target.key_required ? `ULTRAGRAY_API_KEY=${KEY} ` : "";
+  const node = `${key}ultragray-ros --ros-args${parameters.join("")}
+# As a launch file, with settings as the scene has them:
+# ${key}ros2 launch ultragray_ros ultragray.launch.xml address:=${String(given.address)} scene:=${target.scene} scene_frame:=${frame}
 `;
+  const topic = `ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: ${frame}}, pose: {${place}}}'
+# As a transform, for a node with -p source:=tf:
+# ros2 run tf2_ros static_transform_publisher --x ${x} --y ${y} --z ${z} --qx ${i} --qy ${j} --qz ${k} --qw ${w} --frame-id ${frame} --child-frame-id probe
+`;
+  return [node, topic];
 }
 
 /** A value of a parameter as YAML, of which JSON is a part; ROS tells numbers with decimals from whole ones. */

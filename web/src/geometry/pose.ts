@@ -192,12 +192,27 @@ export function between(a: Pose, b: Pose, share: number): Pose {
   const [p, q] = [position(a), position(b)];
   const mix = (i: 0 | 1 | 2): number => p[i] + (q[i] - p[i]) * share;
   const from = quaternion(a);
-  let to = quaternion(b);
+  const to = quaternion(b);
   const dot = from[0] * to[0] + from[1] * to[1] + from[2] * to[2] + from[3] * to[3];
-  if (dot < 0) to = [-to[0], -to[1], -to[2], -to[3]];
-  // neighbours of a sweep lie close: the chord is as good as the arc
-  const blended = from.map((value, i) => value + (to[i]! - value) * share) as unknown as Quaternion;
+  const angle = Math.acos(Math.min(1, Math.abs(dot)));
+  // slerp, the shorter way; of neighbours in a sweep the chord is as good as the arc
+  const [kept, taken] = angle < 1e-3 ? [1 - share, share] : [Math.sin((1 - share) * angle), Math.sin(share * angle)];
+  const blended = from.map((value, i) => kept * value + Math.sign(dot || 1) * taken * to[i]!) as unknown as Quaternion;
   return fromPositionQuaternion([mix(0), mix(1), mix(2)], blended);
+}
+
+/** Poses on a smooth path through others, `steps` from each to the next: positions on a Catmull-Rom spline, orientations by slerp. */
+export function smoothPath(through: readonly Pose[], steps: number): Pose[] {
+  const last = through.length - 1;
+  const at = (place: number): Vector => position(through[Math.max(0, Math.min(last, place))]!);
+  return Array.from({ length: last * steps + 1 }, (_, number) => {
+    const place = Math.min(last - 1, Math.floor(number / steps));
+    const t = number / steps - place;
+    const weights = [t * (t * (2 - t) - 1), t * t * (3 * t - 5) + 2, t * (t * (4 - 3 * t) + 1), t * t * (t - 1)];
+    const points = weights.map((_, i) => at(place - 1 + i));
+    const along = (i: 0 | 1 | 2): number => weights.reduce((sum, weight, k) => sum + (weight * points[k]![i]) / 2, 0);
+    return withPosition(between(through[place]!, through[place + 1]!, t), [along(0), along(1), along(2)]);
+  });
 }
 
 /** The nearest of `poses`, a degree counting as a millimetre; -1 where there are none. */

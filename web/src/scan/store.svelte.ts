@@ -11,6 +11,7 @@ import { planes } from "../session/scene.svelte";
 import { saveBlob } from "../shared/asking.svelte";
 import { colour, GREYS, paint } from "../shared/colours";
 import { fixed, nameIn } from "../shared/text";
+import { videoOf } from "../shared/video";
 import { words } from "../words/words.svelte";
 import { lettersOf, type Mark, type Marks, PLAYED_PER_SECOND, resultOf, type ScanState } from "./scan.svelte";
 
@@ -244,64 +245,12 @@ function even(value: number): number {
   return 2 * Math.ceil(value / 2);
 }
 
-const VIDEO_TYPES = ["video/mp4;codecs=avc1.640028", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
-const BITS_PER_SECOND = 8e6;
-const PIECE_MS = 200;
-const LATE_MS = 5000; // a busy machine may take so long to encode its first picture
-
 /** Throws where the browser cannot make a PNG of that size. */
 export async function pngOf(sheet: Sheet, page: Page): Promise<Blob> {
   sheet.draw(page);
   const blob = await new Promise<Blob | null>((resolve) => sheet.canvas.toBlob(resolve, "image/png"));
   if (blob === null) throw new Error(words.scan.store.noPicture);
   return blob;
-}
-
-/** The type of video that this browser can record; undefined: none. */
-export function videoType(): string | undefined {
-  if (typeof MediaRecorder === "undefined" || !("captureStream" in HTMLCanvasElement.prototype)) return undefined;
-  return VIDEO_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
-}
-
-/** Pages one after another as a video, recorded as they are shown. Throws where the browser cannot record. */
-export async function videoOf(
-  sheet: Sheet,
-  pages: readonly Page[],
-  { perSecond, told }: { perSecond: number; told: (done: number) => void },
-): Promise<{ blob: Blob; suffix: string }> {
-  const mimeType = videoType();
-  if (mimeType === undefined) throw new Error(words.scan.store.noVideo);
-  sheet.draw(pages[0]!);
-  const recorder = new MediaRecorder(sheet.canvas.captureStream(perSecond), { mimeType, videoBitsPerSecond: BITS_PER_SECOND });
-  const parts: Blob[] = [];
-  recorder.ondataavailable = ({ data }) => data.size > 0 && parts.push(data);
-  recorder.start(PIECE_MS);
-  await happened(recorder, "start");
-  const began_ms = performance.now();
-  for (const [index, page] of pages.entries()) {
-    sheet.draw(page);
-    told(index + 1);
-    await pause(began_ms + ((index + 1) * 1000) / perSecond - performance.now());
-  }
-  for (let waited_ms = 0; parts.length === 0 && waited_ms < LATE_MS; waited_ms += PIECE_MS) {
-    sheet.draw(pages.at(-1)!);
-    await pause(PIECE_MS);
-  }
-  recorder.stop();
-  await happened(recorder, "stop");
-  if (parts.length === 0) throw new Error(words.scan.store.noVideo);
-  return { blob: new Blob(parts, { type: mimeType }), suffix: mimeType.startsWith("video/mp4") ? "mp4" : "webm" };
-}
-
-function happened(recorder: MediaRecorder, type: "start" | "stop"): Promise<void> {
-  return new Promise((resolve, reject) => {
-    recorder.addEventListener(type, () => resolve(), { once: true });
-    recorder.addEventListener("error", () => reject(new Error(words.scan.store.noVideo)), { once: true });
-  });
-}
-
-function pause(for_ms: number): Promise<void> {
-  return new Promise((resolve) => setTimeout(resolve, Math.max(0, for_ms)));
 }
 
 /** Storing what is shown: as a picture, as DICOM, and the loop as DICOM or as a video. */
@@ -342,7 +291,9 @@ export class Store {
     return this.#store(words.scan.store.drawing, async () => {
       const pages = this.#loop;
       const told = (done: number): void => void (this.doing = words.scan.store.recording(done, pages.length));
-      const { blob, suffix } = await videoOf(this.#sheet(pages), pages, { perSecond: PLAYED_PER_SECOND, told });
+      const sheet = this.#sheet(pages);
+      const draw = (index: number): void => sheet.draw(pages[index]!);
+      const { blob, suffix } = await videoOf(sheet.canvas, pages.length, { draw, perSecond: PLAYED_PER_SECOND, told });
       saveBlob(blob, `${this.#name}-cine.${suffix}`);
     });
   }

@@ -1,11 +1,8 @@
-/** The scene file that is chosen and sent in Scenes, and the thumbnails of the scenes that are held in memory. */
+/** The scene file that is chosen and sent in Scenes, and the thumbnails of all scenes. */
 
 import { SvelteMap } from "svelte/reactivity";
 
-import { imagePlane } from "../api/contract";
-import { renderPicture } from "../api/rendering";
-import { describeScene, importScene, type SceneEntry } from "../api/scenes";
-import { squarePixel_mm } from "../geometry/plane";
+import { importScene, type SceneEntry, thumbnailOf } from "../api/scenes";
 import { href, router } from "../page/router.svelte";
 import { service } from "../page/service.svelte";
 import { Sending } from "../shared/asking.svelte";
@@ -13,6 +10,7 @@ import { nameOfFile } from "../shared/text";
 
 /** The scene file that is chosen and sent in Scenes. */
 class SceneImport extends Sending {
+  readonly view = "scenes";
   file = $state.raw<File | null>(null);
   name = $state("");
   isPrivate = $state(false);
@@ -36,33 +34,16 @@ class SceneImport extends Sending {
 
 export const sceneImport = new SceneImport();
 
-const SIDE = 128; // samples, scan lines, and pixels of the longer side of a fan
-
-/** A frame from the middle of the training sweep, as a PNG; null: the scene does not know where it was trained. */
-async function thumbnail(scene: string): Promise<Blob | null> {
-  const { training_poses, probe, image_height, image_width } = await describeScene(scene);
-  const { matrix } = training_poses.middle ?? {};
-  if (matrix === undefined || probe === null) return null;
-  const size = { height: Math.min(SIDE, image_height ?? SIDE), width: Math.min(SIDE, image_width ?? SIDE) };
-  const display = { pixel_mm: squarePixel_mm((await imagePlane(probe)).lines_mm, SIDE) };
-  return (await renderPicture(scene, matrix.flat(), { ...size, display })).picture;
-}
-
-/** The thumbnails of the scenes that are held in memory: rendering one of another would load it, and let go of one in use. */
+/** A picture of each scene, by the service: held in memory or not. */
 class Thumbnails {
   /** By scene; null: there will be none. */
   #known = new SvelteMap<string, string | null>();
   #asked = new Set<string>();
   #last: Promise<void> = Promise.resolve();
 
-  /** The address of a picture; null: there is none (yet). */
-  of(scene: SceneEntry): string | null {
-    return this.#known.get(keyOf(scene)) ?? null;
-  }
-
-  /** Whether a picture is on its way. */
-  isComing(scene: SceneEntry): boolean {
-    return scene.loaded && !this.#known.has(keyOf(scene));
+  /** The address of a picture; null: there is none; undefined: it is on its way. */
+  of(scene: SceneEntry): string | null | undefined {
+    return this.#known.get(keyOf(scene));
   }
 
   /** Lets go of the pictures of files that were replaced. */
@@ -74,14 +55,14 @@ class Thumbnails {
     }
   }
 
-  /** Asks for a thumbnail, one after the other: people who scan come first. */
+  /** Asks for a thumbnail, one after the other: the first time, the service draws it. */
   ask(scene: SceneEntry): void {
     const key = keyOf(scene);
-    if (!scene.loaded || this.#asked.has(key)) return;
+    if (scene.error || this.#asked.has(key)) return;
     this.#asked.add(key);
     this.#last = this.#last.then(async () => {
       try {
-        const picture = await thumbnail(scene.name);
+        const picture = await thumbnailOf(scene.name);
         this.#forget(scene.name);
         this.#known.set(key, picture && URL.createObjectURL(picture));
       } catch {

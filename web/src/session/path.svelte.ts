@@ -1,12 +1,13 @@
 /** The path of the probe in a session: poses of a file or a recording, with their times. */
 
 import { explain } from "../api/client";
-import { distance_mm, type Pose } from "../geometry/pose";
+import { distance_mm, nearest, type Pose, smoothPath } from "../geometry/pose";
 import { type Chosen, MOST_BYTES, PoseError, type PoseFile, readPoses } from "../geometry/pose_files";
 import { words } from "../words/words.svelte";
 import { besideSession, type Session } from "./session.svelte";
 
 const EVERY_MS = 33;
+const PER_SECOND = 30; // poses between keyframes
 const MOST_RECORDED = 100_000;
 
 export class Path {
@@ -19,6 +20,9 @@ export class Path {
   /** Whether the recording ended by itself. */
   isFull = $state(false);
   recorded = $state({ count: 0, seconds: 0 });
+  /** Poses that a smooth path leads through, and the time from each to the next. */
+  keyframes = $state.raw<Pose[]>([]);
+  seconds = $state(2);
   readonly poses = $derived.by(() => this.session.trajectory?.poses ?? []);
   readonly length_mm = $derived(this.poses.reduce((sum, pose, i) => sum + (i > 0 ? distance_mm(pose, this.poses[i - 1]!) : 0), 0));
   #source: { name: string; buffer: ArrayBuffer } | null = null;
@@ -68,6 +72,17 @@ export class Path {
     this.problem = null;
     this.#source = this.file = this.times_s = null;
     this.session.follow(null);
+  }
+
+  /** Leads a smooth path through poses, `seconds` from each to the next; it is played where there are two. */
+  lead(keyframes: Pose[], seconds = this.seconds): void {
+    [this.keyframes, this.seconds, this.problem] = [keyframes, seconds, null];
+    if (keyframes.length < 2) return;
+    const poses = smoothPath(keyframes, Math.round(PER_SECOND * seconds));
+    const { trainedPose } = this.session;
+    this.#source = this.file = null;
+    this.#play(words.connect.path.keyframesOf(keyframes.length), poses, poses.map((_, index) => index / PER_SECOND));
+    if (!this.session.frozen) this.session.goTo(nearest(poses, trainedPose)); // where the probe was
   }
 
   /** Takes down what the probe does, until `stop`. */

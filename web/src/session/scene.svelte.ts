@@ -134,6 +134,10 @@ export class KnownScene {
   }
 
   async #take(description: SceneDescription): Promise<void> {
+    if (sameScene(this.description && withoutLabels(this.description), withoutLabels(description))) {
+      this.description = description;
+      return;
+    }
     const probe = description.probe ?? SUBSTITUTE;
     const plane = await planes.get(probe);
     const known = description.training_poses.count > 0 ? await viewsOf(this.name) : null;
@@ -149,6 +153,11 @@ export class KnownScene {
 function sameScene(before: SceneDescription | null, now: SceneDescription): boolean {
   const lasting = (scene: SceneDescription): string => JSON.stringify({ ...scene, loaded: null, loaded_processes: null });
   return before !== null && lasting(before) === lasting(now);
+}
+
+/** A description that other labels leave as it is. */
+function withoutLabels(scene: SceneDescription): SceneDescription {
+  return { ...scene, label_names: {}, file_bytes: 0, outputs: [] };
 }
 
 async function viewsOf(scene: string): Promise<TrainingPoses | null> {

@@ -1,7 +1,10 @@
 /** What takes time: values that follow others calmly, answers that are asked for again and again, files that are sent and kept. */
 
+import { SvelteSet } from "svelte/reactivity";
+
 import { explain, pauseAfter } from "../api/client";
 import type { Told } from "../api/datasets";
+import type { ViewName } from "../page/router.svelte";
 
 const EVERY_MS = 125;
 
@@ -78,7 +81,12 @@ export class Polled<Answer> {
 }
 
 /** Files on their way to the service. They outlive the view that sends them; leaving the page asks first. */
-export class Sending {
+export abstract class Sending {
+  /** Those that are under way, or were not taken, for who looks at another view. */
+  static readonly all = new SvelteSet<Sending>();
+  /** The view that sends it, and what it will be called. */
+  abstract readonly view: ViewName;
+  abstract name: string;
   /** Share of the bytes that were sent, 0 to 1; null: nothing is under way. */
   share = $state<number | null>(null);
   /** Why the last one was not taken. */
@@ -98,6 +106,7 @@ export class Sending {
     addEventListener("beforeunload", ask);
     this.problem = null;
     this.share = 0;
+    Sending.all.add(this);
     try {
       return await send((share) => (this.share = share), signal);
     } catch (error) {
@@ -105,6 +114,7 @@ export class Sending {
       return null;
     } finally {
       this.share = null;
+      if (this.problem === null) Sending.all.delete(this);
       removeEventListener("beforeunload", ask);
     }
   }

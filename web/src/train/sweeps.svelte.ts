@@ -193,6 +193,7 @@ export const simulation = new Simulation();
 
 /** The sweep that is chosen and sent in Train. */
 class SweepUpload extends Sending {
+  readonly view = "train";
   files = $state.raw<File[]>([]);
   name = $state("");
   isPrivate = $state(false);

@@ -31,8 +31,18 @@ from ultragray_service.core.scene_points import (
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scene, SceneLoaded, ScenePage
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import arrivals
-from ultragray_service.http.accept import RAW
-from ultragray_service.http.bodies import LARGE_IMAGE, AssessBody, LocalizeBody, body_schema, read_json_body
+from ultragray_service.http.accept import PNG, RAW
+from ultragray_service.http.bodies import (
+    LABEL_MAP,
+    LARGE_IMAGE,
+    PAINTED_FRAMES,
+    AssessBody,
+    LabelBody,
+    LabelMapBody,
+    LocalizeBody,
+    body_schema,
+    read_json_body,
+)
 from ultragray_service.http.dependencies import (
     BINARY,
     NOT_MODIFIED,
@@ -97,11 +107,11 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     return await finish_or_abandon(work, request.receive, deadline)
 
 
-def _bytes_of(text: str) -> bytes:
+def _bytes_of(text: str, field: str = "image") -> bytes:
     try:
         return base64.b64decode(text, validate=True)
     except ValueError:
-        raise InvalidArgument("image must be base64", field="image") from None
+        raise InvalidArgument(f"{field} must be base64", field=field) from None
 
 
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))
@@ -114,6 +124,30 @@ async def load_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
 async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Frees the scene's memory; no error where it is not loaded."""
     return await service.scenes.unload(scene)
+
+
+_LABELLED: Answers = problems(401, 403, 404, 409, 413, 415, 422, 429, 500, 503, 504, 507)
+
+
+@router.post("/{scene}:label", status_code=201, openapi_extra=body_schema(LabelBody), responses=_LABELLED)
+async def label_scene(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+    """Labels the Gaussians of a scene by frames that somebody painted on. The scene itself stays as it is."""
+    body = await read_json_body(request, LabelBody, PAINTED_FRAMES)
+    frames = [
+        (one.pose.exact(f"frames[{index}].pose"), _bytes_of(one.labels, f"frames[{index}].labels"))
+        for index, one in enumerate(body.frames)
+    ]
+    work = service.labels.by_frames(scene, body, frames, body.probe, body.registration)
+    return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
+
+
+@router.post("/{scene}:label-by-map", status_code=201, openapi_extra=body_schema(LabelMapBody), responses=_LABELLED)
+async def label_scene_by_map(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+    """Labels the Gaussians of a scene by a NIfTI label map. The scene itself stays as it is."""
+    body = await read_json_body(request, LabelMapBody, LABEL_MAP)
+    nifti = await asyncio.to_thread(_bytes_of, body.label_map, "label_map")
+    work = service.labels.by_map(scene, body, nifti, body.registration)
+    return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
 
 
 @dataclass(frozen=True)
@@ -143,6 +177,7 @@ _POINTS = (
     | NOT_MODIFIED
 )
 _POSES: Answers = {200: {"model": ScenePoses}, **NOT_MODIFIED}
+_THUMBNAIL = answer("8-bit grey, square pixels, 128 on the longer side.", PNG) | NOT_MODIFIED
 _FILE = answer("The scene file.", RAW)
 _IMPORT: dict[str, Any] = {
     "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: BINARY}}
@@ -170,6 +205,18 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
         return await asyncio.to_thread(_poses_json, await service.catalog.header(scene))
 
     return await revalidated(request, (await service.catalog.version(scene)).tag, poses, "application/json")
+
+
+@router.get(
+    "/{scene}/thumbnail.png",
+    response_class=Response,
+    responses=_THUMBNAIL | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_thumbnail(request: Request, service: ServiceDep, scene: SceneName) -> Response:
+    """A small frame from the middle of the training sweep; made at the first request, without loading the scene."""
+    service.life.require_serving()
+    key = await service.thumbnails.key(scene)
+    return await revalidated(request, f"{key}-thumbnail", partial(service.thumbnails.png, scene, key), PNG)
 
 
 @router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))

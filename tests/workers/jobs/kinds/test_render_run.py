@@ -3,6 +3,7 @@
 import json
 import sys
 
+import cv2
 import numpy as np
 import pydicom
 import pytest
@@ -61,7 +62,12 @@ def work(tmp_path, random_scene):
 def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work):
     job = RenderJob(scene="one", sampler=CoveredSampler(50, seed=2), outputs=("bmode", "coverage"), dtype="uint8")
     asked = work(job)
-    assert render_run.run(asked, job).artifacts == ("frames.npz",)
+    outcome = render_run.run(asked, job)
+    examples = [f"example_{place:05d}.png" for place in (0, 10, 20, 29, 39, 49)]
+    assert outcome.artifacts == (*examples, "frames.npz")
+    assert outcome.metrics == {}  # the scene knows no confidence
+    drawn = cv2.imread(str(asked.folder.artifacts / examples[0]), cv2.IMREAD_UNCHANGED)
+    assert (drawn.dtype, max(drawn.shape)) == (np.uint8, render_run.EXAMPLE_SIDE)
     assert (asked.progress.frames_done, asked.progress.frames) == (50, 50)
     scene = GaussianScene.load(asked.folder.path / "one.ugr")
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
@@ -80,7 +86,7 @@ def test_tools_are_in_the_frames_with_their_labels(work):
     job = RenderJob(scene="one", sampler=TrainingSampler(), outputs=("bmode", "labels"), tools=tools, ghost=0.5)
     asked = work(job)
     assert from_dict(to_dict(job)) == job
-    assert render_run.run(asked, job).artifacts == ("frames.npz",)
+    assert "frames.npz" in render_run.run(asked, job).artifacts
     scene = GaussianScene.load(asked.folder.path / "one.ugr")
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
         frames = render(scene, None, archive["poses"], height=24, width=20, outputs=job.outputs, tools=tools, ghost=0.5)
@@ -96,7 +102,7 @@ def test_dicom_of_given_poses_in_a_fan(work):
         scene="one", poses=TRAINING[:2].tolist(), sampler=FanSampler(5, 5), format="dicom", height=16, width=12
     )
     asked = work(job)
-    assert render_run.run(asked, job).artifacts == ("frames.dcm",)
+    assert render_run.run(asked, job).artifacts[-1] == "frames.dcm"
     data = pydicom.dcmread(asked.folder.artifacts / "frames.dcm")
     assert data.pixel_array.shape == (6, 16, 12)
     poses = np.frombuffer(data.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
@@ -108,9 +114,11 @@ def test_figures_of_each_frame_are_in_the_archive(work, monkeypatch):
     asked = work(job, confidence=OF_SUPPORT)
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 7)
     monkeypatch.setattr(render_run, "ASSESSED_AT_ONCE", 60)
-    render_run.run(asked, job)
+    metrics = render_run.run(asked, job).metrics
     scene = GaussianScene.load(asked.folder.path / "one.ugr")
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
+        assert metrics["least_confidence"] == pytest.approx(archive["confidence"].min())
+        assert metrics["greatest_confidence"] == pytest.approx(archive["confidence"].max())
         poses = archive["poses"]
         coverage = render(scene, None, poses, height=24, width=20, outputs=("coverage",)).coverage
         told = Assessor(scene.info, TRAINING).assess(poses, coverage=coverage.numpy())

@@ -50,6 +50,10 @@ const sentences: Translated<Words> = {
         `${letter}, ${MARKS[kind]}, Punkt ${point}: mit den Pfeiltasten verschieben, mit Umschalt schneller, Entf entfernt die Messung`,
     },
   },
+  labels: {
+    state: (frames, made) =>
+      made === null ? "Noch ist nichts gespeichert." : `${frames === 1 ? "Ein Bild" : `${frames} Bilder`} angemalt, gespeichert als ${made}.`,
+  },
   scenes: { audit: { span: (hours) => (hours === 1 ? "eine Stunde" : hours === 24 ? "ein Tag" : `${hours / 24} Tage`) } },
   session: {
     link: {

@@ -6,7 +6,7 @@ export const scan = {
   close: "Close",
   room: "Scene in space",
   group: (name: string): string => `${name}: show or hide`,
-  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", registrations: "Registrations", cases: "Cases", path: "Path", connect: "Connect" },
+  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", labels: "Labels", registrations: "Registrations", cases: "Cases", path: "Path", connect: "Connect" },
   image: {
     label: "Live image",
     of: (scene: string): string => `B-mode image of ${scene}`,
@@ -73,7 +73,6 @@ export const scan = {
     nothing: "There is no frame to store yet.",
     noDrawing: "This browser cannot draw the picture.",
     noPicture: "This browser cannot write the picture.",
-    noVideo: "This browser cannot record video. DICOM can hold the loop, too.",
     simulated: "Simulated, not for diagnosis.",
     drawn: (tools: string): string => `Drawn in: ${tools}`,
     slice: (mm: string): string => `slice ${mm} mm`,

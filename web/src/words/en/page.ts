@@ -49,9 +49,12 @@ export const shell = {
     away: "the login does not answer at the moment.",
     noToken: "the login gave no token.",
   },
+  uploading: (name: string): string => `Upload of ${name}`,
+  stopUpload: (name: string): string => `Stop the upload of ${name}`,
+  notUploaded: "not uploaded",
   serviceDown: "The service does not answer. Trying again every second.",
-  notLoaded: "This part of the console could not be loaded.",
-  tryAgain: "Try again",
+  notLoaded: "A part of the console could not be loaded. The service may have been renewed since this page was opened.",
+  reload: "Reload",
   key: {
     asked: "This service asks for a key",
     kept: "It is kept in this tab only, until the tab is closed.",
@@ -86,6 +89,7 @@ function limits(least: number, most: number, unit: string): string {
 }
 
 export const shared = {
+  noVideo: "This browser cannot record video. DICOM can hold many frames, too.",
   chart: (title: string, unit: string, x: string, series: string[]): string =>
     `${title}${unit && ` in ${unit}`} over ${x}: ${series.join(", ")}`,
   nameValue: (line: string): string => `"${line}" must be written as name = value.`,

@@ -2,7 +2,6 @@
 
 import type { Reference } from "../../geometry/pose";
 import { type FaultWords, POSE_SUFFIXES } from "../../geometry/pose_files";
-import type { Named } from "../translated";
 
 const poseError: FaultWords = {
   line: (line, fault) => `Line ${line}: ${fault}`,
@@ -169,17 +168,23 @@ export const connect = {
     recording: (seconds: string, count: number) => `${seconds} s, ${count} poses`,
     full: "The recording has reached its limit of 100,000 poses and was stopped.",
     recorded: (number: number) => `recording ${number}`,
-    none: "Record what the probe does, or load poses. They can then be played, saved and rendered as a data set.",
+    none: "Record what the probe does, add keyframes, or load poses. They can then be played, saved and rendered as a data set.",
     summary: (count: number, seconds: string | null, mm: string) =>
       `${count} poses, ${mm} mm long${seconds === null ? "" : `, ${seconds} s`}`,
     save: "Save poses",
     render: "Render as a data set",
     renderMeans: "Every pose becomes a frame, with the image settings of now, in the background",
     format: "Format of the data set",
-    progress: (done: number, all: number) => `${done} of ${all} frames`,
-    states: { queued: "Waits for its turn", running: "Rendering", succeeded: "Done", failed: "Failed", cancelled: "Cancelled" } as Named,
-    cancel: "Cancel",
-    download: (name: string) => `Download ${name}`,
+    job: "To the job",
+    keyframe: "Add keyframe",
+    keyframeMeans: "A smooth path leads through the poses that are added, and is played, saved, rendered and filmed as others",
+    keyframesOf: (count: number) => (count === 1 ? "1 keyframe" : `${count} keyframes`),
+    between: "Seconds between",
+    withoutLast: "Without the last keyframe",
+    withoutAll: "Without keyframes",
+    film: "Save as film",
+    filmMeans: "Every pose becomes a picture of a video, 30 a second, with the image settings of now",
+    filming: (done: number, all: number) => `Rendering: ${done} of ${all}`,
     may: "start jobs",
   },
   connection: {
@@ -208,7 +213,8 @@ export const connect = {
     intro: "How a program asks for this image:",
     copy: (language: string) => `Copy the example in ${language}`,
     copyShort: "Copy",
-    off: "This service has no OpenIGTLink port. Whoever runs it can open one.",
+    boxes: ["ROS 2: the node", "ROS 2: the pose of now"],
+    off: "This service has no OpenIGTLink port. Whoever runs it opens one: ultragray serve --igtl-port 18944, or ULTRAGRAY_IGTL_PORT=18944.",
     registered: (name: string) => `The pose is flange to base; the service leads it into the scene by ${name}.`,
     notRegistered: "The pose is that of the probe in the scene; a connection of OpenIGTLink names a registration by the parameter Registration.",
     localOnly: "OpenIGTLink answers only programs on the service's own machine.",
@@ -246,6 +252,49 @@ export const connect = {
     docs: "API documentation",
     waiting: "…",
   },
+};
+
+export const labels = {
+  title: "Labels",
+  first: "Tissue 1",
+  another: (label: number): string => `Tissue ${label}`,
+  explain: "Freeze a frame, paint what you see, and spread it through the scene. The result is a new scene with labels.",
+  next: "Move the probe, and correct what is wrong in the next frame.",
+  start: "Paint on this frame",
+  layer: "Image to paint on; arrow keys move the brush, Enter paints",
+  paintWith: "Paint with",
+  choose: (name: string): string => `Paint with ${name}`,
+  nameOf: (label: number): string => `Name of label ${label}`,
+  none: "No label",
+  noneMeans: "Says that there is none of these here",
+  add: "Another label",
+  tools: "Tools to paint with",
+  brushes: { brush: "Brush", region: "Region", eraser: "Eraser" },
+  brushMeans: {
+    brush: "Paints where it is drawn",
+    region: "Paints what is as bright as the point that is pressed, as far as it hangs together",
+    eraser: "Takes paint away: nothing is said there",
+  },
+  undo: "Undo stroke",
+  size: "Brush",
+  sizeMeans: "Diameter of the brush",
+  tolerance: "Tolerance",
+  toleranceMeans: "Grey levels that a region may differ from the point that is pressed",
+  within: "Reach",
+  withinMeans: "How far labels spread to tissue that was not painted and echoes alike",
+  into: "New scene",
+  spread: "Spread",
+  spreadMeans: "Label the scene by all frames that were painted on",
+  spreading: "Labelling the scene…",
+  takeBack: "Take back",
+  takeBackMeans: "Forget the frame that was painted on last",
+  goOn: "Next frame",
+  otherProbe: "The frames before were painted with another probe: take that one again, or take them back.",
+  state: (frames: number, made: string | null): string => {
+    if (made === null) return "Nothing is saved yet.";
+    return `${frames === 1 ? "One frame" : `${frames} frames`} painted, saved as ${made}.`;
+  },
+  open: (scene: string): string => `Open ${scene}`,
 };
 
 export const locate = {

@@ -192,6 +192,13 @@ export const jobs = {
     confidence: "Fitting the confidence",
     report: "Report and files",
   } as Named,
+  rendered: {
+    title: "Rendered frames",
+    confidence: (least: string, greatest: string, mean: string): string => `Confidence ${least} to ${greatest}, mean ${mean}`,
+    frame: (number: number): string => `Frame ${number}`,
+    poses: "Poses",
+    load: "How Python loads them",
+  },
   title: "Jobs",
   unfinished: (count: number): string => (count === 1 ? "1 under way" : `${count} under way`),
   kind: "Kind of job",

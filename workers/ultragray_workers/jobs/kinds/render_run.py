@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
 
-from ultragray.exchange.rendering import assess_by_rendering, render_to_file
-from ultragray.files import file_sha256
+from ultragray.exchange.rendering import assess_by_rendering, render_portions, render_to_file
+from ultragray.files import file_sha256, write_whole
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.sweep import spread_places
 from ultragray.learn.training.memory import training_device
 from ultragray.rendering.limits import Limits
-from ultragray.rendering.settings import Encoding
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.pixels import png_file, to_uint8
+from ultragray.rendering.settings import Encoding, Resolved
 from ultragray.samplers import Assess
 from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.gaussians import GaussianScene
@@ -21,14 +27,15 @@ from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 
+EXAMPLES, EXAMPLE_SIDE = 6, 256  # pictures; pixels of the longer side
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
 
 
 def run(job_run: JobRun, job: RenderJob) -> Outcome:
-    """Renders all poses into `frames` with the suffix of the format.
+    """Renders all poses into `frames` with the suffix of the format, and a few of them as pictures beside it.
 
-    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid, StorageFull,
-    ExtraMissing.
+    The metrics tell the least, mean and greatest confidence of the frames, where the scene knows any. Raises Stopped,
+    InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid, StorageFull, ExtraMissing.
     """
     if job.is_sharded:
         return shards_run.run(job_run, job)
@@ -47,7 +54,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
     with job_run.folder.new_artifacts() as folder:
-        render_to_file(
+        found = render_to_file(
             folder / f"frames{job.file_format.suffix}",
             job.file_format.name,
             scene,
@@ -60,7 +67,32 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
             limits=limits,
             before_portion=job_run.counter(len(poses)),
         )
-    return Outcome(artifacts=job_run.folder.artifact_names())
+        _write_examples(folder, scene, settings, poses, found, limits)
+    confidences = [one.confidence for one in found if one.confidence is not None]
+    metrics = {}
+    if confidences:
+        least, mean, greatest = min(confidences), fmean(confidences), max(confidences)
+        metrics = {"least_confidence": least, "mean_confidence": mean, "greatest_confidence": greatest}
+    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+
+
+def _write_examples(
+    folder: Path,
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    extrapolations: list[Extrapolation],  # [C]
+    limits: Limits,
+) -> None:
+    """A few frames, evenly spread, as pictures true to scale: what one looks at before one loads them all."""
+    places = spread_places(len(poses), EXAMPLES)
+    pixel_mm = settings.display.pixel_mm or settings.probe.box_mm.longer_side / EXAMPLE_SIDE
+    shown = replace(settings, outputs=settings.outputs[:1], display=replace(settings.display, pixel_mm=pixel_mm))
+    portions = render_portions(scene, shown, poses[places], [extrapolations[at] for at in places], limits=limits)
+    (name,) = shown.outputs
+    pictures = (picture for frames, _ in portions for picture in frames[name])
+    for place, picture in zip(places, pictures, strict=True):
+        write_whole(folder / f"example_{place:05d}.png", png_file(to_uint8(OUTPUTS[name].shares(picture))))
 
 
 def _assessing(job_run: JobRun, described: SceneHeader, probe: Probe) -> Assess:

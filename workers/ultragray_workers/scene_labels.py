@@ -1,0 +1,55 @@
+"""Labels for the Gaussians of a scene, given in a helper process. Free of torch until the work begins."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ultragray.contract import from_dict, under
+from ultragray.geometry.probe import Probe
+from ultragray.learn.localization.pixels import read_png
+from ultragray_workers.errors import SceneExists
+
+
+def label_scene(
+    *,
+    scene: str,
+    output: str,
+    replaced: str | None,
+    names: dict[str, str],
+    within_mm: float,
+    frames: list[dict[str, Any]],
+    probe: dict[str, Any] | None,
+    label_map: str | None,
+    map_to_scene: list[list[float]] | None,
+) -> None:
+    """Writes the scene file `scene` with other labels to `output`.
+
+    `frames`: `pose` [4, 4] and `labels`, a PNG file in base64; or `label_map`, a NIfTI file, instead. `replaced` is the
+    file that the output will take the place of: it may differ in its labels alone.
+    Raises what `label_by_frames`, `label_by_map` and `read_label_map` raise, SceneFileInvalid, and SceneExists.
+    """
+    from ultragray.exchange.label_maps import read_label_map
+    from ultragray.learn.labelling import PaintedFrame, label_by_frames, label_by_map, same_but_for_labels
+    from ultragray.scene.gaussians import GaussianScene
+
+    loaded = GaussianScene.load(scene)
+    if replaced is not None and not same_but_for_labels(loaded, GaussianScene.load(replaced)):
+        raise SceneExists(
+            "the scene to be replaced has other Gaussians: only the labels of a scene can be replaced", field="into"
+        )
+    known = {int(label): name for label, name in names.items()}
+    if label_map is not None:
+        volume, affine = read_label_map(label_map)
+        labelled = label_by_map(loaded, volume, affine, names=known, map_to_scene=map_to_scene, within_mm=within_mm)
+    else:
+        painted = []
+        for index, frame in enumerate(frames):
+            with under(f"frames[{index}].labels"):
+                painted.append(PaintedFrame(np.array(frame["pose"]), read_png(base64.b64decode(frame["labels"]))))
+        chosen = None if probe is None else from_dict(Probe, probe)
+        labelled = label_by_frames(loaded, painted, names=known, probe=chosen, within_mm=within_mm)
+    labelled.save(Path(output))
