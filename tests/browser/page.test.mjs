@@ -14,7 +14,8 @@ import { PYTHON, ROOT, Service, SOURCES, TIMEOUT_MS, launch, seriousFindings } f
 const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
 const SEED = 7;
 const MOST = 5e-4; // of a value's difference from the reference
-const MOST_AT_THRESHOLDS = 1e-3; // where a Gaussian just reaches 1/255 for one of the two
+const MOST_AT_THRESHOLDS = 1 / 255; // where a Gaussian just reaches so much for one of the two, as with the native kernels
+const MOST_FLIPS = 1e-4; // share of such values
 
 const folder = mkdtempSync(path.join(tmpdir(), "ultragray-page-"));
 const site = path.join(folder, "page");
@@ -37,37 +38,39 @@ after(async () => {
   rmSync(folder, { recursive: true, force: true });
 });
 
-/** Renders all requests in a page, and compares: the largest difference of each frame, before display settings enlarge it. */
-async function differences() {
+/** Renders all requests in a page, and compares the values, before display settings enlarge a difference. */
+async function differences(MOST) {
   const { Scene } = await import("./index.js");
   const [requests, expected] = await Promise.all([
     fetch("requests.json").then((answer) => answer.json()),
     fetch("expected.bin").then((answer) => answer.arrayBuffer()),
   ]);
   const scene = await Scene.load("scene.ugr");
-  const found = [];
-  let at = 0;
+  let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
   for (const { pose, settings, enlarged } of requests) {
     const frame = await scene.render(pose, settings);
-    let most = 0;
+    frames += 1;
     for (const output of frame.info.outputs) {
       const pixels = frame.pixels(output);
       const wanted = new Float32Array(expected, at, pixels.length);
       at += 4 * pixels.length;
-      for (let k = 0; k < pixels.length; k++) most = Math.max(most, Math.abs(pixels[k] - wanted[k]));
+      values += pixels.length;
+      for (let k = 0; k < pixels.length; k++) {
+        const apart = Math.abs(pixels[k] - wanted[k]) / enlarged;
+        flips += apart > MOST;
+        largest = Math.max(largest, apart);
+      }
     }
-    found.push(most / enlarged);
   }
   scene.close();
-  return { found, left: expected.byteLength - at };
+  return { frames, values, flips, largest, left: expected.byteLength - at };
 }
 
-function check({ found, left }) {
+function check({ frames, values, flips, largest, left }) {
   assert.equal(left, 0);
-  assert.equal(found.length, FRAMES);
-  const high = found.filter((one) => one > MOST);
-  assert.ok(high.length <= 0.02 * FRAMES, `${high.length} of ${FRAMES} frames differ by more than ${MOST}: ${high}`);
-  assert.ok(Math.max(...found) <= MOST_AT_THRESHOLDS, `a frame differs by ${Math.max(...found)}`);
+  assert.equal(frames, FRAMES);
+  assert.ok(flips <= MOST_FLIPS * values, `${flips} of ${values} values differ by more than ${MOST}`);
+  assert.ok(largest <= MOST_AT_THRESHOLDS, `a value differs by ${largest}`);
 }
 
 async function shown(page) {
@@ -83,7 +86,7 @@ async function shown(page) {
 test("random frames in Chromium are those of the reference", async () => {
   const page = await browser.newPage();
   await page.goto(url);
-  check(await page.evaluate(differences));
+  check(await page.evaluate(differences, MOST));
   await page.close();
 });
 
@@ -93,7 +96,7 @@ test("random frames in Firefox are those of the reference", { skip: missing ?? f
     const page = await firefox.newPage();
     page.setDefaultTimeout(TIMEOUT_MS);
     await page.goto(url);
-    check(await page.evaluate(differences));
+    check(await page.evaluate(differences, MOST));
   } finally {
     await firefox.close();
   }
