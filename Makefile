@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -158,6 +158,11 @@ bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and 
 	$(READY)
 	node tests/console/measure.mjs > $(FIGURES)/console.json
 	$(KEEP) console
+
+bench-browser: $(VENV)/installed-dev $(BROWSER) web/node_modules/.package-lock.json  ## frames that Debian's Chromium renders itself, beside the native kernels'; takes ten minutes
+	$(READY)
+	node tests/browser/measure.mjs > $(FIGURES)/browser.json
+	$(KEEP) browser
 
 console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the documents' pictures of the console
 	node tests/console/picture.mjs

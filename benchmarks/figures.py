@@ -42,6 +42,7 @@ _SHOWN = 3  # names of changed files
 TARGETS = {
     **dict.fromkeys(("results", "kernel", "training", "jobs", "clients"), "bench"),
     "console": "bench-console",
+    "browser": "bench-browser",
     **dict.fromkeys(("cuda", "cuda_training"), "bench-cuda"),
     "results_tables": "results",
     "methods_tables": "methods",
@@ -231,6 +232,22 @@ def jobs(measured: Document) -> Lines:
     return columns(rows, {"What": "{what}", "p50 ms": "{p50:.1f}", "p99 ms": "{p99:.1f}"})
 
 
+def frames_in_a_page(measured: Document) -> Lines:
+    """Frames that Chromium renders itself."""
+    memory, size = measured["memory_mib"], "{side}x{side} in the page, one core"
+    timed = "{browser_ms:g} ms, {frames_per_s:.0f} frames/s: {ratio:g} times the native 128 bits' {native_ms:g} ms"
+    rows = [
+        *((size.format_map(one), timed.format_map(one)) for one in measured["sizes"]),
+        ("First frame after the page was opened", f"{measured['first_frame_ms'] / 1000:.2f} s"),
+        (
+            f"Memory of the page after {measured['frames_for_growth']:,} more frames",
+            f"{memory['last']:.0f} MiB, {memory['first']:.0f} at first, at most {memory['most']:.0f}",
+        ),
+        ("Page and renderer", f"{measured['page_gzip_kb']:.0f} KB gzipped"),
+    ]
+    return table(("What", "Measured"), rows)
+
+
 def console(measured: Document) -> Lines:
     """The console in Chromium."""
     shown = {
@@ -317,6 +334,7 @@ BLOCKS = {
     "jobs": Block("jobs", jobs),
     "shards": Block("shards", shards),
     "console": Block("console", console),
+    "frames in a page": Block("browser", frames_in_a_page),
     "environment": Block("environment", environment),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),

@@ -36,11 +36,6 @@ export class Library {
     return library;
   }
 
-  /** The bytes of its memory, which only ever grow. */
-  get memory_bytes(): number {
-    return this.exports.memory.buffer.byteLength;
-  }
-
   /** A scene of the bytes of a scene file, and what it says of itself. */
   load(bytes: Uint8Array): { scene: number; info: string } {
     const scene = this.#with(bytes, (at) => this.exports.ultragray_load(at, bytes.length));

@@ -1,0 +1,101 @@
+/** Measures frames that Debian's Chromium renders itself beside those of the native kernels with 128-bit vectors.
+ *
+ * node tests/browser/measure.mjs [SECONDS]: after the timings it renders for so long, to see memory grow (default 600).
+ * Prints JSON.
+ */
+
+import { execFileSync, spawn } from "node:child_process";
+import { once } from "node:events";
+import { mkdtempSync, readdirSync, readFileSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import path from "node:path";
+import { gzipSync } from "node:zlib";
+
+import { launch, PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
+
+const SIZES = [512, 384];
+const FRAMES = 60; // of each size
+const ROUNDS = 3; // of browser and native kernels in turn
+const SAMPLE_S = 10;
+const seconds = Number(process.argv[2] ?? 600);
+const folder = mkdtempSync(path.join(tmpdir(), "ultragray-measure-"));
+const site = path.join(folder, "page");
+const environment = { ...process.env, PYTHONPATH: SOURCES, OMP_NUM_THREADS: "1" };
+const python = (...words) => execFileSync(PYTHON, words, { env: environment, encoding: "utf8", stdio: ["ignore", "pipe", "inherit"] });
+
+const rounded = (value) => Math.round(value * 100) / 100;
+const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
+
+/** Milliseconds of each frame along the sweep, one after another. */
+async function rendered_ms({ side, frames }) {
+  const { poses } = await (await fetch("page.json")).json();
+  globalThis.scene ??= await (await import("./index.js")).Scene.load("scene.ugr");
+  const found = [];
+  for (let k = -5; k < frames; k++) {
+    const before = performance.now();
+    await globalThis.scene.render(poses[(k + 5) % poses.length], { height: side, width: side });
+    if (k >= 0) found.push(performance.now() - before);
+  }
+  return found;
+}
+
+python(path.join(ROOT, "tests/browser/make_frames.py"), site, "0", "0");
+const server = spawn(PYTHON, ["-u", "-m", "http.server", "--bind", "127.0.0.1", "--directory", site, "0"], { stdio: ["ignore", "pipe", "ignore"] });
+const [line] = await once(server.stdout, "data");
+const url = /http:\/\/[^/]+\//.exec(String(line))[0];
+const browser = await launch();
+try {
+  const cold = await browser.newPage();
+  await cold.goto(url);
+  const first_ms = await cold.evaluate(
+    () =>
+      new Promise((resolve) => {
+        const tell = () => resolve(performance.now());
+        if (/pixels/.test(document.querySelector("#status").value)) tell();
+        else document.querySelector("ultragray-probe").addEventListener("frame", tell, { once: true });
+      }),
+  );
+  await cold.close();
+  const page = await browser.newPage();
+  await page.goto(url);
+  const times = Object.fromEntries(SIZES.map((side) => [side, { browser: [], native: [] }]));
+  for (let round = 0; round < ROUNDS; round++) {
+    for (const side of SIZES) {
+      times[side].browser.push(...(await page.evaluate(rendered_ms, { side, frames: FRAMES })));
+      times[side].native.push(...JSON.parse(python(path.join(ROOT, "tests/browser/measure_native.py"), String(side), String(FRAMES))));
+    }
+  }
+  const sizes = SIZES.map((side) => {
+    const [here, native] = [median(times[side].browser), median(times[side].native)];
+    return { side, browser_ms: rounded(here), native_ms: rounded(native), ratio: rounded(here / native), frames_per_s: rounded(1000 / here) };
+  });
+  const session = await browser.newBrowserCDPSession();
+  /** What the page's process has in memory, its worker with the scene among it. */
+  const memory_mib = async () => {
+    const { processInfo } = await session.send("SystemInfo.getProcessInfo");
+    const kib = processInfo
+      .filter(({ type }) => type === "renderer")
+      .map(({ id }) => Number(/VmRSS:\s+(\d+)/.exec(readFileSync(`/proc/${id}/status`, "utf8"))?.[1] ?? 0));
+    return rounded(Math.max(...kib) / 1024);
+  };
+  await page.evaluate(rendered_ms, { side: 256, frames: 300 });
+  const memory = [await memory_mib()];
+  for (let passed = 0; passed < seconds; passed += SAMPLE_S) {
+    await page.evaluate(rendered_ms, { side: 256, frames: SAMPLE_S * 30 });
+    memory.push(await memory_mib());
+  }
+  const files = readdirSync(site).filter((name) => /\.(js|wasm|html|css)$/.test(name));
+  const figures = {
+    measured: JSON.parse(python("-m", "ultragray_studies.bench.report")),
+    sizes,
+    first_frame_ms: rounded(first_ms),
+    frames_for_growth: Math.ceil(seconds / SAMPLE_S) * SAMPLE_S * 30,
+    memory_mib: { first: memory[0], last: memory.at(-1), most: Math.max(...memory) },
+    page_gzip_kb: rounded(files.reduce((sum, name) => sum + gzipSync(readFileSync(path.join(site, name))).length, 0) / 1000),
+  };
+  process.stdout.write(`${JSON.stringify(figures, null, 2)}\n`);
+} finally {
+  await browser.close();
+  server.kill();
+  rmSync(folder, { recursive: true, force: true });
+}
