@@ -180,6 +180,11 @@ def test_a_file_holds_the_times_and_the_annotations_of_its_frames(http, pose_bod
     for change, field in wrong:
         answer = http.post("/v1/scenes/demo/render", json={**body, **change}, headers=DICOM)
         assert (answer.status_code, answer.json()["field"]) == (422, field)
+    for field, value in [("frame_times_ms", [5.0]), ("annotations", [{**mark, "frame": 0}])]:
+        answer = http.post(
+            "/v1/scenes/demo/render", json={"pose": pose_body, field: value}, headers={"Accept": "image/png"}
+        )
+        assert (answer.status_code, answer.json()["field"]) == (422, field)
 
 
 def test_the_annotations_of_a_loop_may_be_larger_than_its_settings(http, pose_body):
