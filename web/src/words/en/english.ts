@@ -1,4 +1,4 @@
-/** The English catalogue, which has every text of the console: those of english.json, and here the sentences that are given something. */
+/** The English catalogue, which has every text of the console: those of english.json; here the sentences that are given something, and tables that may lack a name. */
 
 import type { Me } from "../../api/service";
 import type { Reference } from "../../geometry/pose";
@@ -59,69 +59,8 @@ const sentences = {
       drawn: (tools: string): string => `Drawn in: ${tools}`,
       slice: (mm: string): string => `slice ${mm} mm`,
     },
-    cases: {
-      all: [
-        [
-          "A bright line in the middle, and black below it.",
-          "Bone: the spinous process and the laminae beside it. Bone reflects what comes and lets hardly anything pass, so that nothing below it is seen. In Maps the transmittance ends at the line.",
-        ],
-        [
-          "A black disc at the right, 2 cm deep.",
-          "No shadow, but a vessel: blood hardly echoes. The tissue below it is as bright as beside it, and the transmittance does not change. Slide along the spine: it stays round.",
-        ],
-        [
-          "Two black columns, and an oval between them.",
-          "The columns are shadows of the articular processes. Between two laminae sound gets into the spinal canal: the oval is the dural sac, and the bright line below it is the back of the vertebra. A needle for a lumbar puncture goes here.",
-        ],
-        [
-          "A straight bright line from the left.",
-          "A needle (Tools). It is thinner than the beam is wide, so that most of the sound passes it: the tissue below it is only a little darker.",
-        ],
-        [
-          "The left side is black from the top on.",
-          "The probe is tilted, and its left side is off the skin: no gel, no sound. A shadow begins at something bright, lost contact at the face.",
-        ],
-        [
-          "Tissue within the shadow of bone.",
-          "Mirror images (Tools, Ghosts): sound goes to and fro between the bone and what lies above it, and comes late. What is seen below bone is not there.",
-        ],
-      ] as const,
-    },
     keys: {
       names: { escape: "Esc", " ": "Space", ctrl: "Ctrl", shift: "Shift", plus: "+", "-": "−" } as Named,
-      steering: [
-        {
-          title: "Steering by keys",
-          lines: [
-            ["← →", "slide along the image (lateral); with Shift rotate"],
-            ["↑ ↓", "slide across the image (elevation); with Shift tilt"],
-            ["Page ↑ Page ↓", "lift and press (axial); with Shift rock"],
-            ["with Alt", "finely"],
-          ],
-        },
-        {
-          title: "On the image",
-          lines: [
-            ["Drag, one finger", "slides the probe: sideways along the image, up and down across it"],
-            ["Shift or right button", "dragging sideways rotates, up and down tilts"],
-            ["Two fingers", "twisting rotates, moving sideways rocks"],
-            ["Pinch", "sets the depth; frozen, zooms"],
-            ["Wheel, dragging", "frozen: zoom, and move what is enlarged"],
-            ["Enter with a tool", "puts a measurement in the middle; arrow keys move its points, Delete removes it"],
-          ],
-        },
-        {
-          title: "Gamepad",
-          lines: [
-            ["Left stick, triggers", "slide"],
-            ["Right stick, shoulders", "turn"],
-            ["A", "freeze"],
-            ["B", "snap"],
-            ["X", "store"],
-            ["Y", "home"],
-          ],
-        },
-      ] as { title: string; lines: [string, string][] }[],
     },
     tgc: {
       slider: (index: number, count: number): string => `Time-gain compensation ${index} of ${count}, dB`,
@@ -151,7 +90,6 @@ const sentences = {
   },
   tools: {
     addOne: (kind: string): string => `Add a ${kind.toLowerCase()}`,
-    kinds: { needle: "Needle", cylinder: "Cylinder", box: "Box" } as Named,
     one: (place: number, kind: string): string => `${place} ${kind}`,
     full: (most: number): string => `An image takes at most ${most} tools.`,
     placeOf: (what: string, axis: string): string => `${what} ${axis}`,
@@ -267,7 +205,6 @@ const sentences = {
     },
     connection: {
       copy: (language: string) => `Copy the example in ${language}`,
-      boxes: ["ROS 2: the node", "ROS 2: the pose of now"],
       registered: (name: string) => `The pose is flange to base; the service leads it into the scene by ${name}.`,
       followOf: (name: string) => `Follow ${name}`,
       following: (name: string) => `Following ${name}`,
@@ -339,7 +276,6 @@ const sentences = {
       calibrationOf: (column: string, row: string, across: string, deep: string): string =>
         `Columns of the image run along the probe's ${column}, rows along its ${row}; its first pixel lies ${across} mm across and ${deep} mm deep from the probe's marker frame.`,
       skewed: (degrees: string): string => `Columns and rows meet at ${degrees}°.`,
-      axes: ["+x", "+y", "+z", "−x", "−y", "−z"],
       frameAlt: (index: number, name: string): string => `Frame ${index} of ${name}`,
       sheetAlt: (index: number): string => `Frame ${index}`,
     },
@@ -381,21 +317,6 @@ const sentences = {
     },
   },
   jobs: {
-    kinds: {
-      train: "training",
-      render: "data set",
-      evaluate: "evaluation",
-      compare: "comparison",
-      voxelize: "volume",
-    } as Named,
-    phases: {
-      baselines: "Classical methods",
-      effort: "Choosing the effort",
-      training: "Training",
-      evaluation: "Measuring",
-      confidence: "Fitting the confidence",
-      report: "Report and files",
-    } as Named,
     rendered: {
       confidence: (least: string, greatest: string, mean: string): string => `Confidence ${least} to ${greatest}, mean ${mean}`,
       frame: (number: number): string => `Frame ${number}`,
