@@ -7,15 +7,17 @@ BIN := $(VENV)/bin
 # As nice as the helpers of a service, for which they wait: those would get what is left over.
 # One thread for matrix products: two, beside other processes, wait for each other in a loop and take up to four times the processor time.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
-KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
+KERNEL_SOURCES := $(wildcard model/kernels/* model/library/*) CMakeLists.txt
 PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py tests/model/library/test_generated.py
 PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples
+CPP_SOURCES := $(wildcard model/kernels/*.[ch]pp model/kernels/*.inl model/library/*.[ch]pp)
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*')
+BROWSER := model/ultragray/exchange/page/ultragray.wasm
 CONSOLE_IF_POSSIBLE = [ -z "$(NPM)" ] || $(MAKE) --no-print-directory console || echo "The console could not be built; all else works without it."
 DATA ?= ../shared/data
 ARGS ?=
@@ -31,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -41,6 +43,8 @@ serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr i
 	@exec $(BIN)/ultragray serve $(ARGS)
 
 console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
+
+browser: $(BROWSER)  ## build @ultragray/web, and the page that `ultragray export --page` writes (apt-get install emscripten nlohmann-json3-dev; needs Node 20 or newer)
 
 test: $(VENV)/collected  ## set up, then run the tests in random order (ARGS="-k probe" for some, ARGS="--randomly-seed=N" for an order again)
 	@$(CONSOLE_IF_POSSIBLE)
@@ -60,6 +64,9 @@ test-notebooks: $(VENV)/installed-dev  ## run every notebook of examples/noteboo
 
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr; mono-mcs mono-runtime libmono-system-net-http4.0-cil for the example in C#) against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
+
+test-browser: $(VENV)/installed-dev $(BROWSER) web/node_modules/.package-lock.json  ## frames that Debian's Chromium and Firefox render themselves, against the library's
+	node --test --test-concurrency=1 tests/browser/*.test.mjs
 
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)
@@ -106,7 +113,7 @@ check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is ge
 check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
 	$(BIN)/ruff format --check $(PYTHON_SOURCES)
-	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
+	$(BIN)/clang-format --dry-run --Werror $(CPP_SOURCES)
 	$(BIN)/hadolint docker/Dockerfile docker/ros.Dockerfile
 
 check-types:
@@ -129,7 +136,7 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/python docs/notebooks.py
 	$(BIN)/ruff check --fix $(PYTHON_SOURCES)
 	$(BIN)/ruff format $(PYTHON_SOURCES)
-	$(BIN)/clang-format -i model/kernels/*.[ch]pp model/kernels/*.inl
+	$(BIN)/clang-format -i $(CPP_SOURCES)
 
 BENCHED := results kernel training jobs clients
 
@@ -229,9 +236,10 @@ demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene fro
 docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
 	$(BIN)/python -m docs.generator
 
-generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract, the client's part of it, snapshots, the console's types
+generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract, the client's part of it, that of libultragray, snapshots, the console's types
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
+	$(BIN)/python model/library/generate.py
 	$(BIN)/python -m docs.generator.snapshots
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent generate
 
@@ -279,6 +287,16 @@ web/node_modules/.package-lock.json: web/package-lock.json
 	@[ -n "$(NPM)" ] || { echo "The console needs Node 20 or newer, with npm"; exit 1; }
 	@echo "Installing what the console is built with ..."
 	@npm --prefix web ci --silent --no-audit --no-fund
+	@touch $@
+
+browser/node_modules/.package-lock.json: browser/package-lock.json
+	@[ -n "$(NPM)" ] || { echo "The page needs Node 20 or newer, with npm"; exit 1; }
+	@npm --prefix browser ci --silent --no-audit --no-fund
+	@touch $@
+
+$(BROWSER): browser/node_modules/.package-lock.json $(KERNEL_SOURCES) web/openapi.json $(wildcard browser/*.* browser/src/*.ts browser/page/*)
+	@command -v emcmake > /dev/null || { echo "WebAssembly is compiled by Emscripten: sudo apt-get install emscripten"; exit 1; }
+	@npm --prefix browser run --silent build
 	@touch $@
 
 $(CONSOLE): web/node_modules/.package-lock.json $(CONSOLE_SOURCES)

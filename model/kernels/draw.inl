@@ -40,11 +40,21 @@ inline Floats profile_slope(Floats u) { return keep(less_equal(u, splat(3.0f)), 
 inline Floats looked_up(const CoarseProfile& table, Floats u) {
     constexpr int kPieces = CoarseProfile::kPieces;
     const Floats v = minimum(maximum(u, splat(-3.3999f)), splat(3.0f));
+#if defined(__wasm_simd128__)
+    // Rounding down by adding 1.5 * 2^23 leaves the piece in the low bits, of which four bytes each find a coefficient.
+    const Ints piece = (Ints)((v * (1.0f / CoarseProfile::kWidth) - 0.5f) + 12582912.0f) & (kPieces - 1);
+    const Ints low = piece * 0x04040404 + 0x03020100;
+    const v128_t high = wasm_i8x16_sub((v128_t)low, wasm_i8x16_splat(16));
+#else
     const Ints piece = __builtin_convertvector(v * (1.0f / CoarseProfile::kWidth) + float(kPieces), Ints);  // mod kPieces
+#endif
     const auto coefficient = [&](int power) {
         const float* row = table.term[power];
 #if defined(__AVX2__)
         return (Floats)_mm256_permutevar8x32_ps(_mm256_load_ps(row), (__m256i)piece);
+#elif defined(__wasm_simd128__)
+        return (Floats)wasm_v128_or(wasm_i8x16_swizzle(wasm_v128_load(row), (v128_t)low),
+                                    wasm_i8x16_swizzle(wasm_v128_load(row + kLanes), high));
 #else
         Floats found;
         for (int k = 0; k < kLanes; ++k) found[k] = row[piece[k] & (kPieces - 1)];

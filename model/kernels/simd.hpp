@@ -8,6 +8,8 @@
 #include <type_traits>
 #if defined(__AVX2__)  // AVX-512 includes it
 #include <immintrin.h>
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
 #endif
 
 namespace {
@@ -76,6 +78,8 @@ inline Mask either(Mask a, Mask b) { return a | b; }
 inline bool any(Mask m) {
 #if defined(__AVX2__)
     return _mm256_movemask_ps((__m256)m) != 0;
+#elif defined(__wasm_simd128__)
+    return wasm_v128_any_true((v128_t)m);
 #else
     int32_t lanes[kLanes], found = 0;
     store(lanes, m);
@@ -86,6 +90,8 @@ inline bool any(Mask m) {
 inline int how_many(Mask m) {
 #if defined(__AVX2__)
     return __builtin_popcount(_mm256_movemask_ps((__m256)m));
+#elif defined(__wasm_simd128__)
+    return __builtin_popcount(wasm_i32x4_bitmask((v128_t)m));
 #else
     int found = 0;
     for (int k = 0; k < kLanes; ++k) found += m[k] != 0;
@@ -118,12 +124,18 @@ inline float total(Floats a) {
 }
 #else
 inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
+#if defined(__wasm_simd128__)
+inline Floats minimum(Floats a, Floats b) { return (Floats)wasm_f32x4_pmin((v128_t)b, (v128_t)a); }
+inline Floats maximum(Floats a, Floats b) { return (Floats)wasm_f32x4_pmax((v128_t)b, (v128_t)a); }
+inline Floats square_root(Floats a) { return (Floats)wasm_f32x4_sqrt((v128_t)a); }
+#else
 inline Floats minimum(Floats a, Floats b) { return select(less_equal(a, b), a, b); }
 inline Floats maximum(Floats a, Floats b) { return select(less_equal(a, b), b, a); }
 inline Floats square_root(Floats a) {
     for (int k = 0; k < kLanes; ++k) a[k] = __builtin_sqrtf(a[k]);
     return a;
 }
+#endif
 inline float smallest(Floats a) {
     float found = a[0];
     for (int k = 1; k < kLanes; ++k) found = a[k] < found ? a[k] : found;

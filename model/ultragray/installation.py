@@ -75,6 +75,14 @@ def missing_extra(error: ImportError, purpose: str, *, field: str | None = None)
     return ExtraMissing(f"{purpose} needs {module}, which is not installed: {install_advice(extra)}", field=field)
 
 
+def c_library() -> tuple[Path, Path]:
+    """libultragray and its header, ultragray.h: frames for programs without Python (docs/howto/engines.md)."""
+    from ultragray import _cpu
+
+    installed = Path(_cpu.__file__).parent
+    return installed / "libultragray.so", installed / "include" / "ultragray.h"
+
+
 _GROUP_LIMITS = (  # of the control group that a container is
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),

@@ -48,8 +48,9 @@ def label_scene(
     else:
         painted = []
         for index, frame in enumerate(frames):
-            with under(f"frames[{index}].labels"):
-                painted.append(PaintedFrame(np.array(frame["pose"]), read_png(base64.b64decode(frame["labels"]))))
+            with under(f"frames[{index}]"):
+                labels = read_png(base64.b64decode(frame["labels"]), "labels")
+            painted.append(PaintedFrame(np.array(frame["pose"]), labels))
         chosen = None if probe is None else from_dict(Probe, probe)
         labelled = label_by_frames(loaded, painted, names=known, probe=chosen, within_mm=within_mm)
     labelled.save(Path(output))

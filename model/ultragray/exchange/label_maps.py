@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,10 +13,10 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
+from ultragray.scene.info import MAX_LABEL
 
 LABEL_MAP_SUFFIXES = (".nii", ".nii.gz")
 MAX_VOXELS = 2**28
-MAX_LABEL_IN_MAP = 255
 
 
 class LabelMap(NamedTuple):
@@ -51,9 +52,10 @@ def read_label_map(path: str | Path) -> LabelMap:
     except InvalidArgument:
         raise
     except Exception as error:  # nibabel raises whatever the reading of a damaged file meets
-        raise InvalidArgument(f"{path.name} cannot be read as NIfTI: {error}", field="label_map") from None
-    if not (values.dtype.kind in "iuf" and (values >= 0).all() and (values <= MAX_LABEL_IN_MAP).all()):
-        raise InvalidArgument(f"label_map must hold numbers from 0 to {MAX_LABEL_IN_MAP}", field="label_map")
+        reason = str(error).replace(str(path), path.name)  # not where a service keeps it
+        raise InvalidArgument(f"{path.name} cannot be read as NIfTI: {reason}", field="label_map") from None
+    if not (values.dtype.kind in "iuf" and (values >= 0).all() and (values <= MAX_LABEL).all()):
+        raise InvalidArgument(f"label_map must hold numbers from 0 to {MAX_LABEL}", field="label_map")
     volume = values.astype(np.uint8)
     if not np.array_equal(volume, values):
         raise InvalidArgument("label_map must hold whole numbers: labels cannot be interpolated", field="label_map")
@@ -61,6 +63,8 @@ def read_label_map(path: str | Path) -> LabelMap:
 
 
 PAINTED_SUFFIX = ".npz"
+UNPAINTED = 255  # a pixel of which nothing is said
+DEFAULT_WITHIN_MM, MAX_WITHIN_MM = 4.0, 50.0  # how far labels spread
 
 
 class PaintedFrames(NamedTuple):
@@ -79,14 +83,15 @@ def read_painted(path: str | Path) -> PaintedFrames:
     if path.suffix != PAINTED_SUFFIX:
         raise InvalidArgument(f"painted frames must end in {PAINTED_SUFFIX}, got {path.name!r}", field="frames")
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             poses, labels = arrays["poses"], arrays["labels"]
-    except (OSError, EOFError, ValueError, KeyError) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InvalidArgument(
             f"{path} must be a .npz file with the arrays poses and labels: {error}", field="frames"
         ) from None
     exact = check_poses(poses)
-    if labels.ndim != 3 or len(labels) != len(exact) or not np.array_equal(labels, labels.astype(np.uint8)):
+    is_whole = labels.dtype.kind in "iuf" and ((labels >= 0) & (labels <= UNPAINTED) & (labels % 1 == 0)).all()
+    if labels.ndim != 3 or len(labels) != len(exact) or not is_whole:
         raise InvalidArgument(
             f"labels of {path.name} must be whole numbers [{len(exact)}, H, W] from 0 to 255, got {labels.dtype} "
             f"{list(labels.shape)}",

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ultragray.errors import InvalidArgument
+from ultragray.exchange.label_maps import MAX_WITHIN_MM, UNPAINTED
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import BoolArray, FloatArray, Probe
@@ -29,12 +30,10 @@ from ultragray.rendering.outputs import INTENSITY_SUM, WEIGHT_SUM
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import MAX_LABEL
 
-UNPAINTED = 255  # a pixel of which nothing is said
 CORRECTION = 4.0  # votes of a painted pixel that would come out otherwise by the frames before
 LEAST_PAINTED = 0.25  # of what a Gaussian shows of itself in a frame: a brush beside it does not reach it
 NEIGHBOURS = 12  # that a Gaussian takes its label from
 SIMILAR_ECHO = 0.2  # difference of intensities, in [0, 1], from which on a neighbour does not count
-MAX_WITHIN_MM = 50.0
 _SH_C0 = 0.5 / math.sqrt(math.pi)  # the harmonic of degree 0
 _LEAST_SUM = 1.0 / 255.0  # of weights: a pixel with less shows nothing
 
@@ -118,7 +117,7 @@ def label_by_map(
         to_mm = check_poses(map_to_scene, field="map_to_scene")[0] @ to_mm
     to_voxels = np.linalg.inv(to_mm)
     means_mm = np.asarray(scene.info.centre_mm) + 10.0 * scene.means.detach().cpu().double().numpy()
-    places = np.rint(means_mm @ to_voxels[:3, :3].T + to_voxels[:3, 3]).astype(np.int64)  # [N, 3]
+    places = np.rint(means_mm @ to_voxels[:3, :3].T + to_voxels[:3, 3])  # [N, 3]
     inside = ((places >= 0) & (places < volume.shape)).all(axis=1)
     if not inside.any():
         raise InvalidArgument(
@@ -126,7 +125,7 @@ def label_by_map(
             field="label_map",
         )
     labels = _labels_of(scene)
-    labels[inside] = volume[tuple(places[inside].T)]
+    labels[inside] = volume[tuple(places[inside].astype(np.int64).T)]
     known |= {label: f"label {label}" for label in np.unique(labels).tolist() if label and label not in known}
     return _with_labels(scene, _spread(scene, labels, inside, within_mm), known)
 
@@ -282,7 +281,7 @@ def _labels_of(scene: GaussianScene) -> LabelArray:  # [N]
 
 
 def _with_labels(scene: GaussianScene, labels: LabelArray, names: Mapping[int, str]) -> GaussianScene:
-    """The same scene with other labels; with none at all where all are 0."""
+    """The same scene with other labels; with none at all where no label has a name."""
     if not names:
         return replace(scene, labels=None, info=replace(scene.info, label_names={}))
     on_device = torch.from_numpy(labels).to(scene.means.device)

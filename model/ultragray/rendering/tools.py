@@ -30,9 +30,7 @@ from ultragray.geometry.pose import (
 )
 from ultragray.geometry.probe import FWHM_PER_SIGMA, MAX_LENGTH_MM, FloatArray, Probe, length_field
 
-BEAM_MM = (
-    2.5  # full width at half maximum of the slice that tools are seen in, where neither frame nor scene has a beam
-)
+BEAM_MM = 2.5  # full width at half maximum of the slice that tools are seen in, without a beam of frame or scene
 LEAST_SLICE_SIGMA_MM = 0.1  # of that slice, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6
 
@@ -105,9 +103,9 @@ def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatAr
 
 def beam_share(low_mm: FloatArray, high_mm: FloatArray, sigma_mm: FloatArray) -> FloatArray:  # [...] all -> [...]
     """The share of a Gaussian beam that lies between two elevations."""
-    ends = (np.asarray(_erf(end / (math.sqrt(2.0) * sigma_mm)), np.float64) for end in (low_mm, high_mm))
-    below_low, below_high = ends
-    return 0.5 * (below_high - below_low)
+    scale = 1.0 / (math.sqrt(2.0) * sigma_mm)
+    share: FloatArray = 0.5 * np.asarray(_erf(high_mm * scale) - _erf(low_mm * scale), np.float64)
+    return share
 
 
 _erf = np.frompyfunc(math.erf, 1, 1)

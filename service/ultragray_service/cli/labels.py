@@ -9,6 +9,7 @@ import numpy as np
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.label_maps import (
+    DEFAULT_WITHIN_MM,
     LABEL_MAP_SUFFIXES,
     PAINTED_SUFFIX,
     parse_names,
@@ -64,7 +65,7 @@ def label(
     label_map: MapOption = None,
     frames: FramesOption = None,
     names: NamesOption = "",
-    within_mm: WithinOption = 4.0,
+    within_mm: WithinOption = DEFAULT_WITHIN_MM,
     registration: Annotated[
         Path | None,
         option("File of `ultragray calibrate` (.json) that leads the map, or poses, into the scene.", shown=False),
@@ -72,12 +73,12 @@ def label(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """The labels of a scene's own stay where the map or the frames say nothing."""
+    """The scene's own labels stay where the map or the frames say nothing."""
     check_source(label_map, frames)
     check_file(output, [SCENE_SUFFIX], force=force)
     read_header(scene)
     known = parse_names(names)
-    led = None if registration is None else load_registration(registration)
+    link = None if registration is None else load_registration(registration)
     painted = None if frames is None else read_painted(frames)
     volume = None if label_map is None else read_label_map(label_map)
 
@@ -87,10 +88,10 @@ def label(
     with working("labelling …"):
         loaded = GaussianScene.load(scene)
         if volume is not None:
-            to_scene = None if led is None else led.base_to_scene
+            to_scene = None if link is None else link.base_to_scene
             labelled = label_by_map(loaded, *volume, names=known, map_to_scene=to_scene, within_mm=within_mm)
         elif painted is not None:
-            poses = painted.poses if led is None else led.probe_to_scene(painted.poses)
+            poses = painted.poses if link is None else link.probe_to_scene(painted.poses)
             pairs = [PaintedFrame(pose, labels) for pose, labels in zip(poses, painted.labels, strict=True)]
             labelled = label_by_frames(loaded, pairs, names=known, within_mm=within_mm)
     labelled.save(output)

@@ -18,7 +18,7 @@ import numpy as np
 from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions, find_source
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.exchange.label_maps import parse_names, read_label_map, read_painted
+from ultragray.exchange.label_maps import DEFAULT_WITHIN_MM, parse_names, read_label_map, read_painted
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
 from ultragray.geometry.pose import check_poses
@@ -225,7 +225,7 @@ def label_scene(
     label_map: MapOption = None,
     frames: FramesOption = None,
     names: NamesOption = "",
-    within_mm: WithinOption = 4.0,
+    within_mm: WithinOption = DEFAULT_WITHIN_MM,
     registration: Annotated[
         str | None, option("Name of the registration that leads the map, or poses, into the scene.", shown=False)
     ] = None,

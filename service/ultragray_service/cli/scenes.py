@@ -125,21 +125,38 @@ EXCHANGED = (".ply", ".pt")
 
 
 @single(
-    "ultragray export liver.ugr -o liver.ply", "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own"
+    "ultragray export liver.ugr -o liver.ply",
+    "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own",
+    "ultragray export liver.ugr --page liver-page && python -m http.server -d liver-page",
 )
 def export(
     scene: SceneFile,
     output: Annotated[
-        Path,
+        Path | None,
         output_option(
             "A .ply file, which holds everything, or a .pt checkpoint of the released code, which gets conf.json "
             "and poses_train.npy beside it: give it a folder of its own."
         ),
-    ],
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(help="A new folder for a web page that renders the scene in the browser, without a service."),
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """`ultragray import` turns either file back into a scene file."""
+    if (output is None) == (page is None):
+        raise InvalidArgument("give either --output or --page", field="output")
+    if page is not None:
+        from ultragray.exchange.page import write_page
+
+        files = write_page(scene, page)
+        size = sum(path.stat().st_size for path in files)
+        words = f"wrote {page}: {len(files)} files, {size / 1e6:.1f} MB; look at it by python -m http.server -d {page}"
+        tell(words, {"files": [*map(str, files)], "bytes": size}, as_json=json)
+        return
+    assert output is not None
     check_ending(output, EXCHANGED)
     folder = output.absolute().parent
     check_file(output if output.suffix == ".ply" or folder.exists() else folder, force=force)

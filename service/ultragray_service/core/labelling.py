@@ -11,6 +11,7 @@ from typing import Any
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import InvalidArgument, SceneFileInvalid
+from ultragray.exchange.label_maps import DEFAULT_WITHIN_MM, MAX_WITHIN_MM
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import Owners
@@ -25,7 +26,6 @@ from ultragray_workers.scenes import SceneStore
 
 LABELLING_TIMEOUT_S = 600.0
 MAX_PAINTED_FRAMES = 200
-DEFAULT_WITHIN_MM, MAX_WITHIN_MM = 4.0, 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +80,10 @@ class SceneLabels:
         Raises what `label_by_frames` and `_label` raise.
         """
         check_painted_count(len(frames))
-        led = None if registration is None else await self._registrations.of_scene(registration, scene)
+        link = None if registration is None else await self._registrations.of_scene(registration, scene)
         painted = [
             {
-                "pose": (pose if led is None else led.probe_to_scene(pose)).tolist(),
+                "pose": (pose if link is None else link.probe_to_scene(pose)).tolist(),
                 "labels": base64.b64encode(labels).decode(),
             }
             for pose, labels in frames
@@ -98,8 +98,8 @@ class SceneLabels:
         """
         base_to_scene = None
         if registration is not None:
-            led = await self._registrations.of_scene(registration, scene)
-            base_to_scene = [list(row) for row in led.base_to_scene]
+            link = await self._registrations.of_scene(registration, scene)
+            base_to_scene = [list(row) for row in link.base_to_scene]
         return await self._label(scene, target, frames=[], probe=None, map_to_scene=base_to_scene, nifti=nifti)
 
     async def _label(self, scene: str, target: LabelTarget, *, nifti: bytes | None = None, **arguments: Any) -> Scene:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import Field, dataclass, field, make_dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any, Literal, TypeVar, get_args
 
@@ -59,6 +59,7 @@ class Apart:
     max_bytes: float = math.inf  # of the whole body
     max_values: float = MAX_VALUES
     max_characters: int = INLINE_BYTES  # of the texts of an element
+    max_other_characters: int = INLINE_BYTES  # of the texts beside them
 
 
 async def read_large(body: bytes, cls: type[T], apart: Apart | None) -> T:
@@ -73,10 +74,11 @@ def _require_size(count: int, apart: Apart | None) -> None:
 
 def _read(body: bytes, cls: type[T], apart: Apart | None) -> T:
     document = _decoded(body, MAX_VALUES if apart is None else apart.max_values)
+    most = INLINE_BYTES if apart is None else apart.max_other_characters
     if apart is None or not isinstance(document, dict) or not isinstance(document.get(apart.key), apart.kind):
-        return _small(document, cls)
+        return _small(document, cls, most)
     much = document[apart.key]
-    rest: Any = _small({**document, apart.key: apart.kind()}, cls)
+    rest: Any = _small({**document, apart.key: apart.kind()}, cls, most)
     if apart.element is not None:
         apart.check_count(len(much))
         much = [_element(apart, index, one) for index, one in enumerate(much)]
@@ -103,9 +105,12 @@ def _decoded(body: bytes, max_values: float) -> Any:
         raise InvalidArgument(f"this must be JSON: {error}") from None
 
 
-def _small(value: Any, cls: type[T]) -> T:
-    if not _is_small(value, _SMALL_VALUES):
-        raise InvalidArgument(f"the body must hold at most {_SMALL_VALUES} values beside its poses", field="body")
+def _small(value: Any, cls: type[T], most_characters: int) -> T:
+    if not _is_small(value, _SMALL_VALUES, most_characters):
+        raise InvalidArgument(
+            f"the body must hold at most {_SMALL_VALUES} values and {most_characters} characters beside its poses",
+            field="body",
+        )
     return read_json(json.dumps(value), cls)
 
 
@@ -119,7 +124,7 @@ def _element(apart: Apart, index: int, value: Any) -> Any:
         raise error_under(path, error, apart.error) from None
 
 
-def _is_small(value: Any, most: int, most_characters: int = INLINE_BYTES) -> bool:
+def _is_small(value: Any, most: int, most_characters: int) -> bool:
     waiting, values, characters = [value], 0, 0
     while waiting and values <= most and characters <= most_characters:
         one = waiting.pop()
@@ -169,17 +174,20 @@ def read_json(text: str | bytes, cls: type[T]) -> T:
 
 
 _POSE_BYTES, _POSE_VALUES = 1024, 32  # with room for indentation, and for what makes a pose none
+_ANNOTATIONS_CHARACTERS = 2**22  # of the pictures over a few hundred frames
+_LONGEST_LOOP_MS = 24 * 3600 * 1000.0
 
 
-def _many_poses(limit: int) -> Apart:
+def _many_poses(limit: int, other_characters: int = INLINE_BYTES) -> Apart:
     return Apart(
         "poses",
         list,
         Pose,
         InvalidPose,
         lambda count: check_pose_count(count, limit),
-        max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
+        max_bytes=other_characters + limit * _POSE_BYTES,
         max_values=2 * _SMALL_VALUES + limit * _POSE_VALUES,
+        max_other_characters=other_characters,
     )
 
 
@@ -278,14 +286,18 @@ class RenderBody(FrameSettings):
     )
     annotations: tuple[Annotation, ...] = described("Of application/dicom: what is burnt into the frames.", ())
 
-    many_poses = staticmethod(_many_poses)
+    many_poses = staticmethod(partial(_many_poses, other_characters=_ANNOTATIONS_CHARACTERS))
 
     def check_stored(self, count: int) -> None:
         """Checks what a file of so many frames is told about them. Raises InvalidArgument."""
         times = self.frame_times_ms
-        if times is not None and (len(times) != count or any(later < one for one, later in pairwise(times))):
+        if times is not None and not (
+            len(times) == count
+            and all(one <= later for one, later in pairwise(times))
+            and times[-1] - times[0] <= _LONGEST_LOOP_MS
+        ):
             raise InvalidArgument(
-                f"frame_times_ms must be a number for each of {count} poses, none below the one before it",
+                f"frame_times_ms must be a number for each of {count} poses, none below the one before it, of one day",
                 field="frame_times_ms",
             )
         for index, one in enumerate(self.annotations):

@@ -342,9 +342,12 @@ def _of_display(parameter: str) -> _DisplayParameter:
 
 def _probe(text: str) -> Probe:
     try:
-        document = json.loads(text)
+        document = to_dict(Probe.named[text]) if text in Probe.named else json.loads(text)
     except (ValueError, RecursionError):
-        raise InvalidProbe(f'must be JSON such as {{"kind": "linear", …}}, got {shown(text)}') from None
+        names = ", ".join(Probe.named)
+        raise InvalidProbe(
+            f'must be one of {names}, or JSON such as {{"kind": "linear", …}}, got {shown(text)}'
+        ) from None
     return from_dict(Probe, document)
 
 

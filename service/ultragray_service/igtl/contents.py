@@ -179,7 +179,10 @@ def unpack_image(content: bytes) -> Image:
         raise IgtlMessageInvalid("IMAGE must be one whole slice of one 8-bit component", field="body")
     _check_size("IMAGE", content, _IMAGE.size + rows * columns)
     pixels = np.frombuffer(content, np.uint8, offset=_IMAGE.size).reshape(rows, columns)
-    return Image(pixels, _unpack_place(vectors, columns, rows))
+    matrix = np.eye(4)
+    matrix[:3] = np.frombuffer(vectors, ">f4").reshape(4, 3).T
+    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
+    return Image(pixels, matrix)
 
 
 def pack_image(image: Image) -> bytes:
@@ -191,29 +194,12 @@ def pack_image(image: Image) -> bytes:
     return _IMAGE.pack(*kind, *size, _pack_place(image.matrix, columns, rows), *part) + image.pixels.tobytes()
 
 
-def unpack_video(content: bytes) -> VideoFrame:
-    if len(content) < _VIDEO.size:
-        raise IgtlMessageInvalid(f"VIDEO must hold {_VIDEO.size} bytes or more, got {len(content)}", field="body")
-    version, _, codec, kind, _, columns, rows, slices, vectors, *part = _VIDEO.unpack_from(content)
-    if (version, slices, part) != (_VIDEO_VERSION, 1, [0, 0, 0, columns, rows, slices]):
-        raise IgtlMessageInvalid("VIDEO must be one whole slice", field="body")
-    matrix = _unpack_place(vectors, columns, rows)
-    return VideoFrame(unpack_text(codec), content[_VIDEO.size :], kind == _KEY, (columns, rows), matrix)
-
-
 def pack_video(frame: VideoFrame) -> bytes:
     """The content of a VIDEO."""
     size = (*frame.size, 1)
     kind = (_LITTLE_ENDIAN, frame.codec.encode(), _KEY if frame.is_key else _FROM_OTHERS, _RAS)
     part = (0, 0, 0, *size)
     return _VIDEO.pack(_VIDEO_VERSION, *kind, *size, _pack_place(frame.matrix, *frame.size), *part) + frame.data
-
-
-def _unpack_place(vectors: bytes, columns: int, rows: int) -> FloatArray:  # [4, 4]
-    matrix = np.eye(4)
-    matrix[:3] = np.frombuffer(vectors, ">f4").reshape(4, 3).T
-    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
-    return matrix
 
 
 def _pack_place(matrix: FloatArray, columns: int, rows: int) -> bytes:

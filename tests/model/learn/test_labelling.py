@@ -158,9 +158,10 @@ def test_what_is_no_label_is_refused(scene, tmp_path):
             label_by_frames(scene, frames, **{"names": names, **more})
         assert refused.value.field == field
     far = np.eye(4)
-    far[:3, 3] = 1e4
-    with pytest.raises(InvalidArgument, match="is it registered"):
-        label_by_map(scene, np.ones((4, 4, 4), np.uint8), far, names=names)
+    for distance_mm in (1e4, 1e30):
+        far[:3, 3] = distance_mm
+        with pytest.raises(InvalidArgument, match="is it registered"):
+            label_by_map(scene, np.ones((4, 4, 4), np.uint8), far, names=names)
 
     def file(values):
         path = tmp_path / f"{values.dtype}-{values.ndim}.nii"
@@ -179,6 +180,11 @@ def test_what_is_no_label_is_refused(scene, tmp_path):
     ]:
         with pytest.raises(InvalidArgument, match=words):
             read_label_map(path)
-    for path, words in [(tmp_path / "frames.npz", "labels"), (tmp_path / "map.png", "must end in")]:
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "frames.npz").read_bytes()[:-40])
+    for path, words in [("frames.npz", "labels"), ("cut.npz", "poses and labels"), ("map.png", "must end in")]:
         with pytest.raises(InvalidArgument, match=words):
-            read_painted(path)
+            read_painted(tmp_path / path)
+    for labels in (["a"], [np.nan], [0.5], [-1], [256], [[1], [1]]):
+        np.savez(tmp_path / "frames.npz", poses=np.eye(4)[None], labels=np.array(labels).reshape(len(labels), 1, 1))
+        with pytest.raises(InvalidArgument, match="whole numbers"):
+            read_painted(tmp_path / "frames.npz")

@@ -173,12 +173,28 @@ def test_a_file_holds_the_times_and_the_annotations_of_its_frames(http, pose_bod
     wrong = [
         ({"frame_times_ms": [5.0]}, "frame_times_ms"),
         ({"frame_times_ms": [5.0, 4.0]}, "frame_times_ms"),
+        ({"frame_times_ms": [5.0, 1e9]}, "frame_times_ms"),
         ({"annotations": [{**mark, "frame": 2}]}, "annotations[0].frame"),
         ({"annotations": [{**mark, "picture": "x"}]}, "annotations[0].picture"),
     ]
     for change, field in wrong:
         answer = http.post("/v1/scenes/demo/render", json={**body, **change}, headers=DICOM)
         assert (answer.status_code, answer.json()["field"]) == (422, field)
+    for field, value in [("frame_times_ms", [5.0]), ("annotations", [{**mark, "frame": 0}])]:
+        answer = http.post(
+            "/v1/scenes/demo/render", json={"pose": pose_body, field: value}, headers={"Accept": "image/png"}
+        )
+        assert (answer.status_code, answer.json()["field"]) == (422, field)
+
+
+def test_the_annotations_of_a_loop_may_be_larger_than_its_settings(http, pose_body):
+    file = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 2), np.uint8)
+    Image.fromarray(noise, "LA").save(file, "PNG")
+    picture = base64.b64encode(file.getvalue()).decode()
+    body = {"poses": [pose_body] * 4, "annotations": [{"frame": frame, "picture": picture} for frame in range(4)]}
+    assert len(picture) > 100_000
+    assert stored(http, body)[1].NumberOfFrames == 4
 
 
 def test_other_outputs_and_float_pixels_are_refused(http, pose_body):

@@ -108,7 +108,7 @@ def test_a_scene_with_other_gaussians_is_not_replaced(http, tmp_path, demo_scene
         ({"frames": []}, "frames"),
         ({"label_names": {"1": "left"}}, "label_names"),
         ({"frames": [{"pose": {"matrix": POSE.tolist()}, "labels": "no base64"}]}, "frames[0].labels"),
-        ({"frames": [{"pose": {"matrix": POSE.tolist()}, "labels": text(b"no PNG")}]}, "frames[0].labels.image"),
+        ({"frames": [{"pose": {"matrix": POSE.tolist()}, "labels": text(b"no PNG")}]}, "frames[0].labels"),
         ({"frames": [{"pose": {"matrix": [[0.0] * 4] * 4}, "labels": text(b"")}]}, "frames[0].pose.matrix"),
         ({"within_mm": -1}, "within_mm"),
         ({"into": "../up"}, "scene"),
@@ -139,6 +139,13 @@ def label_map(tmp_path):
 def is_left_and_right(labels):
     seen = labels > 0
     return (labels[:, :28][seen[:, :28]] == 1).all() and (labels[:, 36:][seen[:, 36:]] == 2).all() and seen.any()
+
+
+@pytest.mark.parametrize("data", [b"", b"no map", b"\x1f\x8b cut", bytes(348)])
+def test_what_is_no_label_map_is_refused_without_saying_where_it_was_kept(http, data):
+    body = {"into": "none", "label_map": text(data)}
+    detail = refused(http.post("/v1/scenes/demo:label-by-map", json=body), "INVALID_ARGUMENT", "label_map")
+    assert "/" not in detail
 
 
 def test_a_registered_label_map_does_the_same_by_every_door(service, http, label_map, tmp_path):

@@ -9,6 +9,8 @@ import pyigtl
 import pytest
 from fastcrc import crc64
 
+from ultragray.contract import from_dict
+from ultragray.geometry.probe import Probe
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.commands import (
     MAX_COMMAND_BYTES,
@@ -109,6 +111,8 @@ def test_every_parameter_is_told_as_it_was_set(peer):
     assert tuple(values) == PARAMETERS
     set_to(peer, **values)
     assert {name: value_of(peer, name) for name in values} == values
+    set_to(peer, Probe="L12-4")
+    assert from_dict(Probe, json.loads(value_of(peer, "Probe"))) == Probe.named["L12-4"]
 
 
 def test_settings_are_those_of_one_connection(connect):

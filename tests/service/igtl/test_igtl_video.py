@@ -13,13 +13,22 @@ from ultragray_service.igtl.contents import (
     state_of,
     unpack_image,
     unpack_status,
-    unpack_video,
 )
 from ultragray_service.igtl.video import VideoEncoder
 
 from .conftest import moved, random_pose
 
 HOUR_MS = 3_600_000
+HEADER = struct.Struct(">HB4sHB3H12f6H")
+KEY = 0x0100
+
+
+def unpack_video(content):
+    _, _, codec, kind, _, columns, rows, _, *numbers = HEADER.unpack_from(content)
+    matrix = np.eye(4)
+    matrix[:3] = np.reshape(numbers[:12], (4, 3)).T
+    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)  # from the centre to the first pixel
+    return VideoFrame(codec.decode(), content[HEADER.size :], kind == KEY, (columns, rows), matrix)
 
 
 class Viewer:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import Annotation
 from ultragray.geometry.probe import Picture
 from ultragray.rendering.pixels import PixelArray
 
-MAX_SIDE = 4096  # of an annotation's picture
+MAX_SIDE = 4096  # of an annotation's picture, and of what it becomes
+MAX_PIXELS = 2**26  # of the pictures of all annotations, which are held at once
 MAX_ENLARGED = 4
 
 
@@ -28,10 +29,14 @@ class AnnotatedPictures:
     """
 
     def __init__(self, picture: Picture, annotations: Sequence[Annotation]) -> None:
-        """Raises InvalidArgument for what is no PNG file, or a large one."""
-        over = [(one.frame, _decoded(one, place)) for place, one in enumerate(annotations)]
+        """Raises InvalidArgument for what is no PNG file, a large or a tall one, or more than MAX_PIXELS."""
+        left = MAX_PIXELS
+        self._over: list[tuple[int, Image.Image]] = []
+        for place, one in enumerate(annotations):
+            self._over.append((one.frame, _decoded(one, f"annotations[{place}].picture", left)))
+            left -= math.prod(self._over[-1][1].size)
         across, down = picture.step
-        enlarged = [round(one.width / picture.width) for _, one in over]
+        enlarged = [round(one.width / picture.width) for _, one in self._over]
         k = self._enlarged = min(MAX_ENLARGED, max([1, *enlarged]))
         first_x, first_z = picture.first[0] + across * (1 - k) / (2 * k), picture.first[1] + down * (1 - k) / (2 * k)
         self.picture = replace(
@@ -41,12 +46,17 @@ class AnnotatedPictures:
             first=(first_x, first_z),
             step=(across / k, down / k),
         )
-        width, self.rows = self.picture.width, self.picture.height
-        self._over: list[tuple[int, Image.Image]] = []
-        for frame, one in over:
-            rows = max(1, round(one.height * width / one.width * abs(across / down)))  # its own pixels are square
-            self._over.append((frame, one.resize((width, rows))))
-            self.rows = max(self.rows, rows)
+        self.rows = max([self.picture.height, *(self._rows(one) for _, one in self._over)])
+        if self.rows > max(self.picture.height, MAX_SIDE):
+            raise InvalidArgument(
+                f"annotations must be at most {MAX_SIDE} rows tall when as wide as the frame, got {self.rows}",
+                field="annotations",
+            )
+
+    def _rows(self, one: Image.Image) -> int:
+        """The height of a picture as wide as the frame: its own pixels are square."""
+        across, down = self.picture.step
+        return max(1, round(one.height * self.picture.width / one.width * abs(across / down)))
 
     def burnt(self, pixels: PixelArray, frame: int) -> PixelArray:  # [H, W] uint8 -> [rows, k·W] uint8
         """The frame of a number, enlarged, with the pictures over it and the band below it."""
@@ -55,19 +65,23 @@ class AnnotatedPictures:
         whole[: len(enlarged)] = enlarged
         for own, one in self._over:
             if own == frame:
-                part = whole[: one.height]
-                grey, share = np.moveaxis(np.asarray(one, np.float32), -1, 0)
+                placed = one.resize((self.picture.width, self._rows(one)))
+                part = whole[: placed.height]
+                grey, share = np.moveaxis(np.asarray(placed, np.float32), -1, 0)
                 part[:] = np.rint(part + share / 255.0 * (grey - part))
         return whole
 
 
-def _decoded(annotation: Annotation, place: int) -> Image.Image:
+def _decoded(annotation: Annotation, path: str, max_pixels: int) -> Image.Image:
     """The picture of an annotation, grey and opacity."""
-    path = f"annotations[{place}].picture"
     try:
         image = Image.open(io.BytesIO(base64.b64decode(annotation.picture, validate=True)), formats=["PNG"])
-        if max(image.size) > MAX_SIDE:
-            raise InvalidArgument(f"{path} must have at most {MAX_SIDE} rows and columns, got {image.size}", field=path)
-        return image.convert("LA")
-    except (binascii.Error, UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise InvalidArgument(f"{path} must be a PNG file in base64: {error}", field=path) from error
+        if max(image.size) <= MAX_SIDE and math.prod(image.size) <= max_pixels:
+            return image.convert("LA")
+    except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InvalidArgument(f"{path} must be a whole PNG file in base64", field=path) from error
+    raise InvalidArgument(
+        f"{path} must have at most {MAX_SIDE} rows and columns, and all together {MAX_PIXELS:,} pixels, it has "
+        f"{image.size}",
+        field=path,
+    )

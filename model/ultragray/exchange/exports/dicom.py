@@ -124,7 +124,8 @@ class DicomExporter(Exporter):
         data.BurnedInAnnotation, data.LossyImageCompression = "YES" if header.annotations else "NO", "00"
         comments = "\r\n".join(one.text for one in header.annotations if one.text)
         if comments:
-            data.ImageComments = comments[:MAX_COMMENTS]
+            allowed = "".join(one for one in comments if one.isprintable() or one in "\r\n\t")
+            data.ImageComments = allowed[:MAX_COMMENTS]
 
     def _describe_pixels(self, data: Dataset) -> None:
         """The modules Image Pixel, Cine, Multi-frame and US Image."""

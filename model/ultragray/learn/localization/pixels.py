@@ -29,13 +29,13 @@ def read_frame(path: Path) -> Any:  # [H, W]
         raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
 
 
-def read_png(data: bytes) -> ByteArray:  # [H, W]
+def read_png(data: bytes, field: str = "image") -> ByteArray:  # [H, W]
     """The frame of a PNG file; colours become their luma, 16 bits become 8.
 
     Raises InvalidArgument, InvalidImageSize.
     """
     if not data.startswith(_PNG) or len(data) < _SIZE_AT + 8:
-        raise InvalidArgument("image must be a PNG file, which it is not", field="image")
+        raise InvalidArgument(f"{field} must be a PNG file, which it is not", field=field)
     width, height = struct.unpack_from(">II", data, _SIZE_AT)
     check_image_size(height, width)  # before it takes the memory that the file says
     import cv2
@@ -45,7 +45,7 @@ def read_png(data: bytes) -> ByteArray:  # [H, W]
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise InvalidArgument("image is a damaged PNG file", field="image")
+        raise InvalidArgument(f"{field} is a damaged PNG file", field=field)
     return np.asarray(pixels, np.uint8)
 
 

@@ -14,6 +14,7 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
+from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
 from ultragray.rendering.outputs import OUTPUTS
@@ -105,6 +106,9 @@ async def render(request: Request) -> Response:
         check_format("dicom", body.outputs, body.dtype)
         body.check_stored(len(poses))
         await asyncio.to_thread(exporter_class, "dicom")  # refused before anything is rendered
+    elif body.frame_times_ms is not None or body.annotations:
+        field = "annotations" if body.annotations else "frame_times_ms"
+        raise InvalidArgument(f"{field} can be told by {DICOM} alone, and Accept asks for another type", field=field)
 
     def complete(settings: Resolved) -> Resolved:
         return planner.check_pixels(FORMATS["dicom"].shown(settings) if is_dicom else settings, len(poses))

@@ -5,7 +5,9 @@ import dataclasses
 import io
 import json
 import shutil
+import struct
 import subprocess
+import zlib
 from datetime import datetime, timezone
 
 import numpy as np
@@ -207,7 +209,7 @@ def test_annotations_are_burnt_into_their_frames_and_told(tmp_path):
     below = round(5 * (50 / 21) / 2.0)
     shows = np.zeros((25 + below, 19), bool)
     shows[:, 4] = True
-    one = Annotation(frame=2, picture=drawn(*shows.shape, shows), text="A  12.3 mm × 8 mm")
+    one = Annotation(frame=2, picture=drawn(*shows.shape, shows), text="A  12.3 mm\0\x1b × 8 mm")
     asked = dataclasses.replace(header(), annotations=(one,), made_at=MADE)
     data = written(tmp_path / "frames.dcm", asked)
     assert data.BurnedInAnnotation == "YES"
@@ -233,12 +235,40 @@ def test_frames_are_enlarged_to_a_finer_annotation_and_stay_where_they_are(tmp_p
     assert position_cm(region, 3 * 7 + 1, 3 * 9 + 1) == pytest.approx(position_cm(plain, 7, 9))
 
 
-@pytest.mark.parametrize("picture", ["", "no base64", base64.b64encode(b"no PNG").decode(), drawn(4097, 1, 0)])
+def png(height, width, chunk=b""):
+    """A PNG file in base64 that claims a size, and ends behind a chunk."""
+
+    def packed(data):
+        return struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
+
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + packed(header) + packed(b"zTXt" + chunk) + packed(b"IDAT")).decode()
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        "",
+        "no base64",
+        "é",
+        base64.b64encode(b"no PNG").decode(),
+        drawn(4097, 1, 0),
+        png(20_000, 20_000),
+        png(9, 9, b"k\0\0" + zlib.compress(bytes(5_000_000))),
+    ],
+)
 def test_an_annotation_that_is_no_picture_is_refused(tmp_path, picture):
     asked = dataclasses.replace(header(), annotations=(Annotation(picture=picture),))
     with pytest.raises(InvalidArgument, match=r"annotations\[0\].picture must") as told:
         written(tmp_path / "frames.dcm", asked)
     assert told.value.field == "annotations[0].picture"
+
+
+def test_annotations_that_would_make_a_tower_or_fill_the_memory_are_refused(tmp_path):
+    for pictures, words in [([drawn(4096, 1, 0)], "4096 rows"), ([drawn(4096, 4096, 0)] * 5, "67,108,864 pixels")]:
+        asked = dataclasses.replace(header(), annotations=tuple(Annotation(picture=one) for one in pictures))
+        with pytest.raises(InvalidArgument, match=words):
+            written(tmp_path / "frames.dcm", asked)
 
 
 @pytest.mark.skipif(shutil.which("dciodvfy") is None, reason="the validator of Debian's dicom3tools is not installed")

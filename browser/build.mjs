@@ -1,0 +1,24 @@
+/** Builds dist/, and the files of the exported page in the Python package: types of the contract, the modules, and the renderer in WebAssembly, which Debian's emscripten compiles. */
+
+import { execFileSync } from "node:child_process";
+import { copyFileSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
+import { fileURLToPath } from "node:url";
+import openapiTS, { astToString } from "openapi-typescript";
+
+const here = (path) => fileURLToPath(new URL(path, import.meta.url));
+const run = (command, ...words) => execFileSync(command, words, { cwd: here("."), stdio: "inherit" });
+
+mkdirSync(here("src/generated"), { recursive: true });
+const document = JSON.parse(readFileSync(here("../web/openapi.json"), "utf8"));
+writeFileSync(here("src/generated/openapi.ts"), astToString(await openapiTS(document)));
+run(here("node_modules/.bin/tsc"));
+
+const build = here("../build/browser");
+run("emcmake", "cmake", "-S", here(".."), "-B", build, "-DULTRAGRAY_PYTHON=OFF", "-DCMAKE_BUILD_TYPE=Release");
+run("cmake", "--build", build, "--parallel", "2");
+copyFileSync(`${build}/ultragray.wasm`, here("dist/ultragray.wasm"));
+
+const page = here("../model/ultragray/exchange/page");
+mkdirSync(page, { recursive: true });
+for (const name of readdirSync(here("page"))) copyFileSync(here(`page/${name}`), `${page}/${name}`);
+for (const name of readdirSync(here("dist")).filter((one) => /\.(js|wasm)$/.test(one))) copyFileSync(here(`dist/${name}`), `${page}/${name}`);

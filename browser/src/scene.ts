@@ -1,0 +1,262 @@
+/** A scene whose frames are rendered here, or by a service: both behind `Scene`, so that a page changes by one word. */
+
+import type { components } from "./generated/openapi.js";
+import type { Answer, Request } from "./worker.js";
+
+type Schemas = components["schemas"];
+
+/** What is rendered, as every door of the service takes it. Left out: as the scene has it. */
+export type Settings = Partial<Omit<Schemas["RenderSettings"], "registration">>;
+/** Of each output as shares (uint8 0 to 255, float32 0 to 1), labels as numbers. */
+export type Output = string;
+
+/** A pose: a matrix [4, 4] of 16 numbers, row by row, from the probe to the scene, mm. */
+export type Pose = readonly number[];
+
+/** Where the pixels of a picture lie in the image plane; see Picture of the HTTP reference. */
+export type Picture = Schemas["Picture"];
+
+export interface FrameInfo {
+  outputs: Output[];
+  encoding: "uint8" | "float32";
+  height: number;
+  width: number;
+  picture: Picture;
+}
+
+/** The pixels of one pose. */
+export class Frame {
+  constructor(
+    readonly info: FrameInfo,
+    private readonly bytes: Uint8Array<ArrayBuffer>,
+  ) {}
+
+  /** One output, [height, width] row by row. Throws for one that was not asked for. */
+  pixels(output: Output = this.info.outputs[0]!): Uint8Array | Float32Array {
+    const { outputs, encoding, height, width } = this.info;
+    const count = height * width;
+    let at = 0;
+    for (const one of outputs) {
+      const wide = encoding === "float32" && one !== "labels";
+      if (one === output) return wide ? new Float32Array(this.bytes.slice(at, at + 4 * count).buffer) : this.bytes.subarray(at, at + count);
+      at += wide ? 4 * count : count;
+    }
+    throw new Error(`the frame has ${outputs.join(", ")}, not ${output}`);
+  }
+
+  /** One output in grey, for a canvas. */
+  imageData(output?: Output): ImageData {
+    const pixels = this.pixels(output);
+    const scale = pixels instanceof Float32Array ? 255 : 1;
+    const image = new ImageData(this.info.width, this.info.height);
+    pixels.forEach((value, at) => {
+      image.data.fill(value * scale, 4 * at, 4 * at + 3);
+      image.data[4 * at + 3] = 255;
+    });
+    return image;
+  }
+}
+
+export interface Scene {
+  /** What the scene says of itself: probe, size of its images, labels … */
+  readonly info: SceneInfo;
+  /** The frame of a pose. Throws, in a sentence, for a pose or settings that cannot be. */
+  render(pose: Pose, settings?: Settings): Promise<Frame>;
+  close(): void;
+}
+
+/** The fields of a scene's own description that both ways of rendering tell. */
+export interface SceneInfo {
+  probe: Schemas["Scene"]["probe"];
+  image_height: number | null;
+  image_width: number | null;
+  label_names: Record<string, string>;
+  [name: string]: unknown;
+}
+
+const MOST_VIEWS = 4; // settings that are kept ready
+
+class LocalScene implements Scene {
+  #views = new Map<string, Promise<{ view: number; info: FrameInfo }>>();
+
+  constructor(
+    private readonly renderer: Renderer,
+    private readonly scene: number,
+    readonly info: SceneInfo,
+  ) {}
+
+  async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
+    const { view, info } = await this.#view(JSON.stringify(settings));
+    return new Frame(info, await this.renderer.ask<Uint8Array<ArrayBuffer>>({ act: "render", view, pose: checked(pose) }));
+  }
+
+  close(): void {
+    this.renderer.close();
+  }
+
+  #view(settings: string): Promise<{ view: number; info: FrameInfo }> {
+    let kept = this.#views.get(settings);
+    if (kept === undefined) {
+      kept = this.renderer
+        .ask<{ view: number; info: string }>({ act: "prepare", scene: this.scene, settings })
+        .then(({ view, info }) => ({ view, info: JSON.parse(info) as FrameInfo }));
+      kept.catch(() => this.#views.delete(settings)); // the next one is told again what is wrong
+    }
+    this.#views.delete(settings);
+    this.#views.set(settings, kept); // the newest is the last
+    for (const [oldest, view] of this.#views) {
+      if (this.#views.size <= MOST_VIEWS) break;
+      this.#views.delete(oldest);
+      void view.then(({ view }) => this.renderer.ask({ act: "freeView", view }));
+    }
+    return kept;
+  }
+}
+
+/** The worker that renders one scene; its memory goes with it. */
+class Renderer {
+  #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
+  #number = 0;
+  #asked = new Map<number, { resolve: (result: unknown) => void; reject: (error: Error) => void }>();
+
+  constructor() {
+    this.#worker.onmessage = ({ data: { number, result, problem } }: MessageEvent<Answer>) => {
+      const asked = this.#asked.get(number);
+      this.#asked.delete(number);
+      if (problem === undefined) asked?.resolve(result);
+      else asked?.reject(new Error(problem));
+    };
+    this.#worker.onerror = ({ message }) => this.#end(new Error(`the renderer does not start: ${message}`));
+  }
+
+  ask<Result>(request: Request): Promise<Result> {
+    return new Promise((resolve, reject) => {
+      this.#number += 1;
+      this.#asked.set(this.#number, { resolve: resolve as (result: unknown) => void, reject });
+      this.#worker.postMessage({ number: this.#number, request });
+    });
+  }
+
+  close(): void {
+    this.#worker.terminate();
+    this.#end(new Error("the scene is closed"));
+  }
+
+  #end(error: Error): void {
+    for (const { reject } of this.#asked.values()) reject(error);
+    this.#asked.clear();
+  }
+}
+
+type Waiting = { resolve: (frame: Frame) => void; reject: (error: Error) => void };
+
+class ServedScene implements Scene {
+  #socket: Promise<WebSocket> | undefined;
+  #sequence = 0;
+  #waiting = new Map<number, Waiting>();
+  #sent = "";
+
+  constructor(
+    private readonly address: URL,
+    private readonly protocols: string[],
+    readonly info: SceneInfo,
+  ) {}
+
+  async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
+    const matrix = checked(pose);
+    this.#socket ??= this.#open();
+    const socket = await this.#socket;
+    return new Promise((resolve, reject) => {
+      this.#sequence += 1;
+      this.#waiting.set(this.#sequence, { resolve, reject });
+      const written = JSON.stringify(settings);
+      const rows = [0, 4, 8, 12].map((at) => matrix.slice(at, at + 4));
+      const changed = written === this.#sent ? {} : { settings };
+      this.#sent = written;
+      socket.send(JSON.stringify({ sequence: this.#sequence, mode: "ordered", pose: { matrix: rows }, ...changed }));
+    });
+  }
+
+  close(): void {
+    void this.#socket?.then((socket) => socket.close());
+  }
+
+  #open(): Promise<WebSocket> {
+    return new Promise((resolve, reject) => {
+      const socket = new WebSocket(this.address, this.protocols);
+      socket.binaryType = "arraybuffer";
+      socket.onopen = () => resolve(socket);
+      socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => this.#take(data);
+      socket.onclose = () => {
+        const lost = new Error(`the connection to ${this.address.host} ended`);
+        reject(lost);
+        for (const { reject: refuse } of this.#waiting.values()) refuse(lost);
+        this.#waiting.clear();
+        this.#socket = undefined; // the next pose opens another
+        this.#sent = "";
+      };
+    });
+  }
+
+  #take(data: ArrayBuffer | string): void {
+    if (typeof data === "string") {
+      const { sequence, error } = JSON.parse(data) as Schemas["RefusalMessage"];
+      this.#sent = ""; // settings that were refused are not those of the stream
+      this.#settle(sequence)?.reject(new Error(error.detail));
+      return;
+    }
+    const length = new DataView(data).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
+    const begin = Math.ceil((4 + length) / 8) * 8;
+    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin)));
+  }
+
+  #settle(sequence: number): Waiting | undefined {
+    const waiting = this.#waiting.get(sequence);
+    this.#waiting.delete(sequence);
+    return waiting;
+  }
+}
+
+function checked(pose: Pose): number[] {
+  if (pose.length !== 16) throw new Error(`a pose must have 16 numbers, [4, 4] row by row, got ${pose.length}`);
+  return [...pose];
+}
+
+async function bytesOf(source: string | URL | Uint8Array): Promise<Uint8Array> {
+  if (source instanceof Uint8Array) return source;
+  const answer = await fetch(source);
+  if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
+  return new Uint8Array(await answer.arrayBuffer());
+}
+
+export const Scene = {
+  /** A scene file, of an address or of its bytes, whose frames are rendered here. Throws, in a sentence, for what is none. */
+  async load(source: string | URL | Uint8Array): Promise<Scene> {
+    const bytes = await bytesOf(source);
+    const renderer = new Renderer();
+    try {
+      const { scene, info } = await renderer.ask<{ scene: number; info: string }>({ act: "load", bytes });
+      const told = JSON.parse(info) as SceneInfo;
+      told.label_names ??= {}; // a file without labels says nothing of them
+      return new LocalScene(renderer, scene, told);
+    } catch (error) {
+      renderer.close();
+      throw error;
+    }
+  },
+
+  /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed. */
+  async connect(service: string | URL, name: string, { key }: { key?: string } = {}): Promise<Scene> {
+    const address = new URL(`/v1/scenes/${encodeURIComponent(name)}`, service);
+    const answer = await fetch(address, key === undefined ? {} : { headers: { Authorization: `Bearer ${key}` } });
+    if (!answer.ok) throw new Error(`${address.href} answers ${answer.status} ${answer.statusText}`);
+    const info = (await answer.json()) as SceneInfo;
+    const stream = new URL(`${address.pathname}/stream`, address);
+    stream.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+    return new ServedScene(stream, key === undefined ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`], info);
+  },
+};
+
+const base64url = (text: string): string =>
+  btoa(String.fromCharCode(...new TextEncoder().encode(text))).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");

@@ -1,0 +1,67 @@
+// Poses, probes and pictures: where each pixel lies (ultragray.geometry says what the words mean). Lengths are mm.
+#pragma once
+
+#include <array>
+#include <vector>
+
+#include "../kernels/render.hpp"
+#include "contract.hpp"
+
+namespace ultragray::library {
+
+using Vector = std::array<double, 3>;
+
+// A rigid transform from the probe to the scene, and the point that a point goes to.
+struct Pose {
+    double turn[3][3];
+    Vector origin;
+
+    // Of a matrix [4, 4], row by row; a rotation within 1e-3 of a proper one becomes it. `name` is the caller's. Throws
+    // Fault.
+    static Pose read(const double* matrix, const std::string& name);
+    Vector turned(const Vector& v) const;
+    Vector turned_back(const Vector& v) const;
+    Vector at(const Vector& point) const;
+};
+
+// A point of the image plane by its scan line: the depth along it, and its place `across`, mm or degrees.
+struct Place {
+    double depth, across;  // a depth of NaN: no line comes by
+};
+
+// A probe, whatever its kind: its bundle of scan lines from `near_mm` to `far_mm`, and the depth of its face.
+struct Probing {
+    enum class Lines { Parallel, Fanned, Radial } lines;
+    double span;  // of all lines, mm or degrees
+    double steering_deg;
+    double near_mm, far_mm, face_mm;
+
+    static Probing of(const Probe& probe);
+    Probing ending_at(double far) const;
+    bool is_angular() const { return lines != Lines::Parallel; }
+    bool wraps() const { return lines == Lines::Radial; }
+    double start() const { return wraps() ? 0.0 : -span / 2; }
+    double length_mm() const { return far_mm - near_mm; }
+    double depth_mm(int row, int height) const { return near_mm + length_mm() * (row + 0.5) / height; }
+    double breadth_mm(double depth) const;  // of a row of the image
+    // Origin and unit direction of the line at a place: x and z of each.
+    void ray(double across, double origin[2], double direction[2]) const;
+    Vector point(double row, double column) const;  // of image coordinates from 0 to 1, in the probe's frame
+    std::vector<Vector> corners() const;
+    Place place(double x, double z) const;
+    // The pose's axes as the kernels take them, in cm: parallel lines run along z in a sheared plane.
+    void kernel_pose(const Pose& pose, const Vector& centre, double matrix[16]) const;
+    ProbeGeometry kernel(int height, const std::optional<ElevationBeam>& beam) const;
+};
+
+// A grid of pixels in the image plane: see Picture in ultragray.geometry.probe.
+struct Picture {
+    int height, width;
+    std::string column_unit;
+    double first[2], step[2];  // column and row
+
+    static Picture of_frame(const Probing& probe, int height, int width);
+    static Picture of_plane(const Probing& probe, double pixel_mm);
+};
+
+}  // namespace ultragray::library

@@ -1,0 +1,73 @@
+// The C interface: no exception leaves it.
+#include "ultragray.h"
+
+#include <cstdio>
+#include <new>
+
+#include "frames.hpp"
+
+using namespace ultragray::library;
+
+struct ultragray_scene {
+    std::shared_ptr<const LoadedScene> scene;
+};
+struct ultragray_view {
+    View view;
+};
+
+namespace {
+
+thread_local char problem[1024];  // nothing that wants to be destroyed as a thread ends: WebAssembly has no such end
+
+void tell(const char* sentence) { std::snprintf(problem, sizeof problem, "%s", sentence); }
+
+// What `act` returns, or `failed`, with the problem told.
+template <class Result, class Act>
+Result guarded(Result failed, const Act& act) {
+    try {
+        return act();
+    } catch (const std::bad_alloc&) {
+        tell("the memory does not suffice");
+    } catch (const std::exception& error) {
+        tell(error.what());
+    }
+    return failed;
+}
+
+}  // namespace
+
+ultragray_scene* ultragray_load(const void* bytes, size_t size) {
+    return guarded<ultragray_scene*>(nullptr, [&] {
+        if (bytes == nullptr) throw Fault("there are no bytes of a scene file");
+        auto loaded = std::make_shared<LoadedScene>(LoadedScene{Scene::read(bytes, size), nullptr});
+        if (loaded->scene.info.tissue_shares) loaded->tissue = std::make_unique<FollowingTissue>(loaded->scene);
+        return new ultragray_scene{std::move(loaded)};
+    });
+}
+
+const char* ultragray_scene_info(const ultragray_scene* scene) { return scene->scene->scene.info.json.c_str(); }
+
+void ultragray_free_scene(ultragray_scene* scene) { delete scene; }
+
+ultragray_view* ultragray_prepare(const ultragray_scene* scene, const char* settings) {
+    return guarded<ultragray_view*>(nullptr, [&] {
+        if (scene == nullptr) throw Fault("there is no scene");
+        return new ultragray_view{View(scene->scene, settings ? settings : "")};
+    });
+}
+
+const char* ultragray_view_info(const ultragray_view* view) { return view->view.json().c_str(); }
+
+size_t ultragray_frame_bytes(const ultragray_view* view) { return view->view.frame_bytes(); }
+
+void ultragray_free_view(ultragray_view* view) { delete view; }
+
+int ultragray_render(const ultragray_view* view, const double* poses, size_t count, int threads, void* pixels) {
+    return guarded(1, [&] {
+        if (view == nullptr || poses == nullptr || pixels == nullptr) throw Fault("view, poses and pixels must be given");
+        view->view.render(poses, count, threads < 1 ? 1 : threads, pixels);
+        return 0;
+    });
+}
+
+const char* ultragray_problem(void) { return problem; }

@@ -1,0 +1,245 @@
+"""libultragray against the Python library: its C interface, called as an engine calls it."""
+
+import ctypes
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ultragray import GaussianScene
+from ultragray.contract import from_dict
+from ultragray.installation import c_library
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.frames import render_shown
+from ultragray.rendering.pixels import in_type
+from ultragray.rendering.settings import RenderSettings
+
+IDENTITY = np.eye(4)
+EXACT = [
+    {},
+    {"encoding": "float32", "outputs": ["bmode", "echo", "transmittance", "coverage", "attenuation"]},
+    {"outputs": ["labels", "bmode"], "height": 100, "width": 130},
+    {"probe": "C5-2", "height": 90, "width": 75},
+    {"probe": "P4-2", "slice_thickness_mm": 2.5, "height": 64, "width": 65, "encoding": "float32"},
+    {
+        "probe": {"kind": "steered", "width_mm": 40, "steering_deg": 20, "near_mm": 1, "far_mm": 50},
+        "encoding": "float32",
+    },
+    {"display": {"gain_db": 6, "dynamic_range_db": 45, "tgc_db": [0, 3, -2], "depth_mm": 30, "flip": True}},
+    {"display": {"gain_db": 6, "edge": 1.5}, "encoding": "float32"},
+]
+INTERPOLATED = [
+    {"display": {"pixel_mm": 0.5}, "encoding": "float32"},
+    {"probe": {"kind": "radial", "near_mm": 2, "far_mm": 30}, "display": {"pixel_mm": 0.5}, "encoding": "float32"},
+    {
+        "probe": "C5-2",
+        "display": {"pixel_mm": 0.7, "flip": True},
+        "encoding": "float32",
+        "outputs": ["coverage", "bmode"],
+    },
+]
+
+
+@pytest.fixture(scope="module")
+def library():
+    path, header = c_library()
+    assert header.is_file()
+    loaded = ctypes.CDLL(str(path))
+    pointer, text, size = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t
+    for name, result, arguments in (
+        ("load", pointer, (text, size)),
+        ("scene_info", text, (pointer,)),
+        ("free_scene", None, (pointer,)),
+        ("prepare", pointer, (pointer, text)),
+        ("view_info", text, (pointer,)),
+        ("frame_bytes", size, (pointer,)),
+        ("free_view", None, (pointer,)),
+        ("render", ctypes.c_int, (pointer, pointer, size, ctypes.c_int, pointer)),
+        ("problem", text, ()),
+    ):
+        function = getattr(loaded, f"ultragray_{name}")
+        function.restype, function.argtypes = result, arguments
+    return loaded
+
+
+class Scene:
+    """A scene that the library holds."""
+
+    def __init__(self, library, data):
+        self.library = library
+        self.pointer = library.ultragray_load(data, len(data))
+        assert self.pointer, self.problem
+
+    @property
+    def problem(self):
+        return self.library.ultragray_problem().decode()
+
+    def render(self, settings, poses):
+        """What it tells of the frames, and their bytes [C, bytes]."""
+        view = self.library.ultragray_prepare(self.pointer, json.dumps(settings).encode())
+        assert view, self.problem
+        pixels = np.empty((len(poses), self.library.ultragray_frame_bytes(view)), np.uint8)
+        matrices = np.ascontiguousarray(poses, np.float64)
+        code = self.library.ultragray_render(view, matrices.ctypes.data, len(poses), 2, pixels.ctypes.data)
+        info = json.loads(self.library.ultragray_view_info(view))
+        self.library.ultragray_free_view(view)
+        assert code == 0, self.problem
+        return info, pixels
+
+
+@pytest.fixture(scope="module")
+def scene(library):
+    held = Scene(library, DEMO_FILE.read_bytes())
+    yield held
+    library.ultragray_free_scene(held.pointer)
+
+
+@pytest.fixture(scope="module")
+def python_scene():
+    return GaussianScene.load(DEMO_FILE)
+
+
+@pytest.fixture(scope="module")
+def following_scene(python_scene):
+    """The scene, as if its tissue had been dragged along a path that its tracker told with errors."""
+    tracked = python_scene.training_poses
+    at_rest, errors = tracked.copy(), np.repeat(IDENTITY[None], len(tracked), axis=0)
+    at_rest[:, :3, 3] += np.sin(np.arange(len(tracked)) / 3.0)[:, None] * [0.8, 0.0, 0.5]
+    errors[:, :3, 3] = np.random.default_rng(2).normal(scale=0.1, size=(len(tracked), 3))
+    return GaussianScene.from_splats(
+        python_scene.splats,
+        info=replace(python_scene.info, tissue_shares=(0.6, 0.3, 1.0)),
+        training_poses=tracked,
+        labels=python_scene.labels,
+        pose_corrections=errors,
+        rest_poses=at_rest,
+    )
+
+
+def poses_beside(scene, count):
+    """Training poses, shifted and turned by a little."""
+    random = np.random.default_rng(3)
+    poses = scene.training_poses[:: len(scene.training_poses) // count][:count].copy()
+    poses[:, :3, 3] += random.normal(scale=2.0, size=(count, 3))
+    return poses
+
+
+def both(scene, python_scene, settings, poses):
+    """Each output [C, H, W] of the library and of Python."""
+    asked = from_dict(RenderSettings, settings)
+    resolved = asked.resolved(python_scene.info, asked.encoding)
+    shown = render_shown(python_scene, resolved, poses)
+    info, pixels = scene.render(settings, poses)
+    assert (info["height"], info["width"]) == (resolved.picture.height, resolved.picture.width)
+    assert info["picture"]["first"] == pytest.approx(resolved.picture.first)
+    assert info["picture"]["step"] == pytest.approx(resolved.picture.step)
+    at = 0
+    for name in resolved.outputs:
+        expected = in_type(shown[name].numpy(), np.uint8 if name == "labels" else asked.encoding.pixel_type)
+        part = pixels[:, at : at + expected[0].nbytes]
+        at += expected[0].nbytes
+        yield part.copy().view(expected.dtype).reshape(expected.shape), expected
+    assert at == pixels.shape[1]
+
+
+@pytest.mark.parametrize("settings", EXACT, ids=json.dumps)
+def test_frames_are_those_of_python_byte_for_byte(scene, python_scene, settings):
+    for found, expected in both(scene, python_scene, settings, poses_beside(python_scene, 3)):
+        assert expected.any()
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("settings", INTERPOLATED, ids=json.dumps)
+def test_scan_converted_frames_are_as_near_as_float32_is(scene, python_scene, settings):
+    for found, expected in both(scene, python_scene, settings, poses_beside(python_scene, 2)):
+        assert expected.any()
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_poses_lead_into_tissue_that_followed_the_probe(library, following_scene):
+    poses = poses_beside(following_scene, 4)
+    held = Scene(library, following_scene.to_bytes())
+    for found, expected in both(held, following_scene, {"height": 80, "width": 90}, poses):
+        np.testing.assert_array_equal(found, expected)
+    rigid = Scene(library, following_scene.at_rest().to_bytes())
+    assert not np.array_equal(rigid.render({"height": 80, "width": 90}, poses)[1], found.reshape(len(poses), -1))
+
+
+def test_a_view_outlives_its_scene(library, python_scene):
+    data = DEMO_FILE.read_bytes()
+    pointer = library.ultragray_load(data, len(data))
+    view = library.ultragray_prepare(pointer, None)
+    library.ultragray_free_scene(pointer)
+    pose = np.ascontiguousarray(python_scene.training_poses[0])
+    pixels = np.zeros(library.ultragray_frame_bytes(view), np.uint8)
+    assert library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data) == 0
+    assert pixels.any()
+    library.ultragray_free_view(view)
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ("[", "the settings are no JSON"),
+        ('{"height": 0}', "height must be an integer from 1 to 4096, got 0"),
+        ('{"heigth": 10}', "heigth is not a known key"),
+        ('{"probe": {"kind": "linear", "near_mm": 0, "far_mm": 50}}', "probe.width_mm is required by the probe linear"),
+        (
+            '{"probe": {"kind": "cone"}}',
+            "probe.kind must be one of convex, linear, phased, radial, steered, got 'cone'",
+        ),
+        ('{"display": {"gain_db": 300}}', "display.gain_db must be a finite number from -100 to 100, got 300"),
+        ('{"display": {"pixel_mm": 0.002}}', "at most 4096 pixels on a side"),
+        ('{"outputs": ["sound"]}', "outputs must be some of bmode, "),
+        ('{"contact": "air"}', "contact can be shown by a service alone"),
+        ('{"min_confidence": 0.5}', "min_confidence can be judged by a service alone"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(scene, settings, problem):
+    assert scene.library.ultragray_prepare(scene.pointer, settings.encode()) is None
+    assert problem in scene.problem
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda pose: pose * 2.0, "must end in the row 0 0 0 1"),
+        (lambda pose: pose * np.array([[1.2], [1.2], [1.2], [1.0]]), "must hold a rotation: the largest entry"),
+        (lambda pose: np.diag([-1.0, 1.0, 1.0, 1.0]) @ pose, "determinant +1"),
+        (lambda pose: pose + np.nan, "must be finite"),
+        (lambda pose: pose + np.outer([2e6, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]), "must lie within 1e+06 mm"),
+    ],
+)
+def test_wrong_poses_are_one_sentence(scene, change, problem):
+    view = scene.library.ultragray_prepare(scene.pointer, b'{"height": 8, "width": 8}')
+    pose = np.ascontiguousarray(change(IDENTITY))
+    pixels = np.zeros(64, np.uint8)
+    assert scene.library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data) != 0
+    assert scene.problem.startswith("poses[0] must")
+    assert problem in scene.problem
+    scene.library.ultragray_free_view(view)
+
+
+def test_hostile_scene_files_are_one_sentence(library):
+    """Cut anywhere, and with bytes of the header changed at random: refused, or read; never a crash."""
+    data = DEMO_FILE.read_bytes()
+    header = 8 + int.from_bytes(data[:8], "little")
+    random = np.random.default_rng(5)
+    cuts = [data[:size] for size in (0, 7, 8, 100, header - 1, header, header + 1, len(data) - 1)]
+    changed = []
+    for _ in range(200):
+        one = bytearray(data[:header])
+        for place in random.integers(0, header, size=random.integers(1, 6)):
+            one[place] = random.integers(0, 256)
+        changed.append(bytes(one) + data[header:])
+    for one in (*cuts, *changed, os.urandom(5000)):
+        pointer = library.ultragray_load(one, len(one))
+        if pointer:
+            library.ultragray_free_scene(pointer)
+        else:
+            assert library.ultragray_problem()
+    for one in cuts:
+        assert not library.ultragray_load(one, len(one))
+        assert "cut off" in library.ultragray_problem().decode()
