@@ -83,13 +83,8 @@ export function composed(outer: Pose, inner: Pose): Pose {
 }
 
 /** The pose turned about the probe's own axes by small angles in degrees; the point `pivot_mm` deep on its axis stays. */
-export function rotated(pose: Pose, [x_deg, y_deg, z_deg]: Vector, pivot_mm: number): Pose {
-  const turn = multiply(
-    multiply(aboutAxis([0, 0, 1], z_deg), aboutAxis([0, 1, 0], y_deg)),
-    aboutAxis([1, 0, 0], x_deg),
-  );
-  const q = normalised(multiply(quaternion(pose), turn));
-  return pivoted(pose, q, pivot_mm);
+export function rotated(pose: Pose, angles_deg: Vector, pivot_mm: number): Pose {
+  return pivoted(pose, normalised(orientationFrom(pose, angles_deg)), pivot_mm);
 }
 
 /** The pose with another orientation, the point `pivot_mm` deep on its axis where it was. */
@@ -176,8 +171,7 @@ export function orientationFrom(home: Pose, [tilt_deg, rock_deg, rotation_deg]: 
 }
 
 export function distance_mm(a: Pose, b: Pose): number {
-  const [p, q] = [position(a), position(b)];
-  return Math.hypot(p[0] - q[0], p[1] - q[1], p[2] - q[2]);
+  return length(minus(position(a), position(b)));
 }
 
 /** The angle between two orientations. */
@@ -189,8 +183,7 @@ export function angle_deg(a: Pose, b: Pose): number {
 
 /** The pose a share of the way from one to another. */
 export function between(a: Pose, b: Pose, share: number): Pose {
-  const [p, q] = [position(a), position(b)];
-  const mix = (i: 0 | 1 | 2): number => p[i] + (q[i] - p[i]) * share;
+  const place = plus(scaled(position(a), 1 - share), scaled(position(b), share));
   const from = quaternion(a);
   const to = quaternion(b);
   const dot = from[0] * to[0] + from[1] * to[1] + from[2] * to[2] + from[3] * to[3];
@@ -198,7 +191,7 @@ export function between(a: Pose, b: Pose, share: number): Pose {
   // slerp, the shorter way; of neighbours in a sweep the chord is as good as the arc
   const [kept, taken] = angle < 1e-3 ? [1 - share, share] : [Math.sin((1 - share) * angle), Math.sin(share * angle)];
   const blended = from.map((value, i) => kept * value + Math.sign(dot || 1) * taken * to[i]!) as unknown as Quaternion;
-  return fromPositionQuaternion([mix(0), mix(1), mix(2)], blended);
+  return fromPositionQuaternion(place, blended);
 }
 
 /** Poses on a smooth path through others, `steps` from each to the next: positions on a Catmull-Rom spline, orientations by slerp. */
@@ -277,8 +270,7 @@ export function withPlaceIn({ position_mm, angles_deg }: Place, reference: Refer
 
 /** A direction in the scene as the pose's own axes have it. */
 function alongAxes(pose: Pose, way: Vector): Vector {
-  const q = quaternion(pose);
-  return apply(fromPositionQuaternion([0, 0, 0], [q[0], -q[1], -q[2], -q[3]]), way);
+  return [dot(axis(pose, 0), way), dot(axis(pose, 1), way), dot(axis(pose, 2), way)];
 }
 
 /** What a registration makes of poses. */

@@ -1,8 +1,8 @@
 /** Poses as people and programs write them: one as text, many as JSON, CSV, TUM, NumPy or PLUS. What is read is checked as the service checks it. */
 
 import {
-  anglesFrom, entry, fromPositionQuaternion, IDENTITY, orientationFrom, type Pose, position, quaternion,
-  type Quaternion, type Vector, withPosition,
+  anglesFrom, axis, cross, dot, entry, fromPositionQuaternion, IDENTITY, orientationFrom, type Pose, position, quaternion,
+  type Quaternion, scaled, type Vector, withPosition,
 } from "./pose";
 
 /** What can be wrong with poses: by the name of its sentence in the catalogues, what that is given. */
@@ -70,8 +70,10 @@ function poseOfMatrix(numbers: readonly number[], where: Where = {}): Pose {
   if (pose.length !== 16) throw new PoseError("count", [numbers.length, "12, 16"], where);
   const last = [0, 0, 0, 1].some((expected, column) => Math.abs(entry(pose, 3, column) - expected) > ROTATION_TOLERANCE);
   if (last) throw new PoseError("lastRow", [], where);
-  if (rotationError(pose) > ROTATION_TOLERANCE) throw new PoseError("rotation", [], where);
-  if (determinant(pose) < 0) throw new PoseError("mirror", [], where);
+  const [x, y, z] = [axis(pose, 0), axis(pose, 1), axis(pose, 2)];
+  const products = [dot(x, x) - 1, dot(y, y) - 1, dot(z, z) - 1, dot(x, y), dot(y, z), dot(z, x)]; // of RᵀR − 1
+  if (!products.every((one) => Math.abs(one) <= ROTATION_TOLERANCE)) throw new PoseError("rotation", [], where);
+  if (dot(cross(x, y), z) < 0) throw new PoseError("mirror", [], where);
   return fromPositionQuaternion(position(pose), quaternion(pose));
 }
 
@@ -87,26 +89,6 @@ function numberOf(text: string, where: Where = {}): number {
   const number = Number(text);
   if (text.trim() === "" || !Number.isFinite(number)) throw new PoseError("number", [text.slice(0, 40)], where);
   return number;
-}
-
-/** The largest entry of RᵀR − 1. */
-function rotationError(pose: Pose): number {
-  let largest = 0;
-  for (let a = 0; a < 3; a++)
-    for (let b = 0; b < 3; b++) {
-      const product = [0, 1, 2].reduce((sum, row) => sum + entry(pose, row, a) * entry(pose, row, b), 0);
-      largest = Math.max(largest, Math.abs(product - (a === b ? 1 : 0)));
-    }
-  return Number.isFinite(largest) ? largest : Infinity;
-}
-
-function determinant(pose: Pose): number {
-  const m = (row: number, column: number): number => entry(pose, row, column);
-  return (
-    m(0, 0) * (m(1, 1) * m(2, 2) - m(1, 2) * m(2, 1)) -
-    m(0, 1) * (m(1, 0) * m(2, 2) - m(1, 2) * m(2, 0)) +
-    m(0, 2) * (m(1, 0) * m(2, 1) - m(1, 1) * m(2, 0))
-  );
 }
 
 const MOST_POSES = 100_000;
@@ -271,18 +253,13 @@ export interface Chosen {
 /** Poses whose lengths are in `unit`, brought to mm. Throws PoseError for too few or too many. */
 function fileOf(poses: Pose[], times_s: number[] | null, unit: Unit, unitIsKnown: boolean): PoseFile {
   requireCount(poses.length);
-  const scaled = unit === "mm" ? poses : poses.map((pose) => withPosition(pose, metres(pose)));
-  return { poses: scaled, times_s, unit, unitIsKnown, takesUnit: true, transforms: [], transform: null, skipped: 0 };
+  const inMm = unit === "mm" ? poses : poses.map((pose) => withPosition(pose, scaled(position(pose), PER_METRE)));
+  return { poses: inMm, times_s, unit, unitIsKnown, takesUnit: true, transforms: [], transform: null, skipped: 0 };
 }
 
 function requireCount(count: number): void {
   if (count === 0) throw new PoseError("empty", []);
   if (count > MOST_POSES) throw new PoseError("tooMany", [count, MOST_POSES]);
-}
-
-function metres(pose: Pose): Vector {
-  const [x, y, z] = position(pose);
-  return [x * PER_METRE, y * PER_METRE, z * PER_METRE];
 }
 
 interface Row {
@@ -332,7 +309,7 @@ function csvOf(poses: readonly Pose[], times_s: readonly number[] | null): strin
 function tumOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
   const lines = poses.map((pose, index) => {
     const [w, x, y, z] = quaternion(pose);
-    const place = position(pose).map((value) => (value / 1000).toFixed(7));
+    const place = position(pose).map((value) => (value / PER_METRE).toFixed(7));
     return [(times_s?.[index] ?? index).toFixed(4), ...place, ...[x, y, z, w].map(digits)].join(" ");
   });
   return ["# timestamp tx ty tz qx qy qz qw", ...lines, ""].join("\n");

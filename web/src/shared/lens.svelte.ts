@@ -36,6 +36,20 @@ export class Lens {
     this.#stay();
   }
 
+  /** Attaches the wheel: it enlarges about the share that `about` says, or does nothing where that is null. */
+  byWheel(about: (event: WheelEvent) => Share | null): (element: HTMLElement) => () => void {
+    return (element) => {
+      const turn = (event: WheelEvent): void => {
+        const share = about(event);
+        if (share === null) return;
+        event.preventDefault();
+        this.zoomBy(-Math.sign(event.deltaY), share);
+      };
+      element.addEventListener("wheel", turn, { passive: false }); // Svelte listens passively, and the page would scroll
+      return () => element.removeEventListener("wheel", turn);
+    };
+  }
+
   reset(): void {
     [this.zoom, this.x, this.y] = [1, 0.5, 0.5];
   }

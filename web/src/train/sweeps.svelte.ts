@@ -1,6 +1,7 @@
 /** Sweeps on their way to the service: what their files say, where they are cropped, how they are sent, and which there are. */
 
 import { type Dataset, type DatasetOptions, listDatasets, simulateDataset, uploadDataset } from "../api/datasets";
+import { axis, dot, length, position, type Vector } from "../geometry/pose";
 import { Attempt, Listed, Sending } from "../shared/asking.svelte";
 import { nameOfFile } from "../shared/text";
 
@@ -364,10 +365,8 @@ export interface Calibration {
 
 /** Reads a matrix [4, 4], row by row. */
 export function readCalibration(matrix: readonly number[]): Calibration {
-  const column = [0, 4, 8].map((at) => matrix[at]!);
-  const row = [1, 5, 9].map((at) => matrix[at]!);
-  const origin = [3, 7, 11].map((at) => matrix[at]!);
-  const along = (axis: readonly number[]): number => dot(origin, axis) / length(axis);
+  const [column, row, origin] = [axis(matrix, 0), axis(matrix, 1), position(matrix)];
+  const along = (way: Vector): number => dot(origin, way) / length(way);
   return {
     column: directionOf(column),
     row: directionOf(row),
@@ -380,12 +379,4 @@ export function readCalibration(matrix: readonly number[]): Calibration {
 function directionOf(vector: readonly number[]): number {
   const axis = vector.reduce((best, value, at) => (Math.abs(value) > Math.abs(vector[best]!) ? at : best), 0);
   return axis + (vector[axis]! < 0 ? 3 : 0);
-}
-
-function dot(one: readonly number[], other: readonly number[]): number {
-  return one.reduce((sum, value, at) => sum + value * other[at]!, 0);
-}
-
-function length(vector: readonly number[]): number {
-  return Math.sqrt(dot(vector, vector));
 }

@@ -1,4 +1,4 @@
-/** What the console says, in the language of the person: `words.scan.freeze`. Each area has a file in `en` and in `de`. */
+/** What the console says, in the language of the person: `words.scan.freeze`, from the catalogue in `en` or `de`. */
 
 import { english, type Words } from "./en/english";
 import { translated } from "./translated";
