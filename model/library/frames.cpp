@@ -26,16 +26,14 @@ void check_local(const RenderSettings& settings, const SceneInfo& info) {
         refuse("encoding", "must be uint8 or float32 for local frames");
     if (settings.contact) refuse("contact", "can be shown by a service alone");
     if (settings.speckle != Speckle::Off) refuse("speckle", "can be drawn by a service alone");
-    if (settings.tools && !settings.tools->empty()) refuse("tools", "can be drawn by a service alone");
-    if (settings.ghost.value_or(0.0) != 0.0) refuse("ghost", "can be drawn by a service alone");
     if (settings.display &&
         (!settings.display->gain_db_between.empty() || !settings.display->dynamic_range_db_between.empty()))
         refuse("display", "can be drawn at random by a service alone");
     for (const std::string& output : settings.outputs) {
         if (std::find(kOutputs.begin(), kOutputs.end(), output) == kOutputs.end())
             refuse("outputs", "must be some of " + joined(kOutputs) + ", got '" + output + "'");
-        if (is_numbers(output) && info.label_names.empty())
-            refuse("outputs", "may name labels only for a scene whose Gaussians carry labels; this one's carry none");
+        if (is_numbers(output) && info.label_names.empty() && (!settings.tools || settings.tools->empty()))
+            refuse("outputs", "may name labels only for a scene whose Gaussians carry labels, or for frames with tools");
     }
 }
 
@@ -135,37 +133,56 @@ void View::render(const double* poses, size_t count, int threads, void* pixels) 
         render_one(Pose::read(poses + 16 * c, "poses[" + std::to_string(c) + "]"), threads, out + c * frame_bytes());
 }
 
+bool View::asks_for(const char* output) const {
+    return std::find(settings_.outputs.begin(), settings_.outputs.end(), output) != settings_.outputs.end();
+}
+
+// The planes that the outputs follow from, and those that tools and ghosts do.
+Planes View::planes(const ProbeGeometry& probe, const double* pose, int threads) const {
+    const size_t size = size_t(height_) * width_;
+    const bool beam = asks_for("transmittance") || asks_for("attenuation");
+    const bool ghosts = settings_.ghost.value_or(0.0) > 0.0 && (beam || asks_for("bmode") || asks_for("echo"));
+    const bool tools = settings_.tools && !settings_.tools->empty() && asks_for("bmode");
+    Planes drawn;
+    if (ghosts || asks_for("bmode")) drawn.bmode.resize(size);
+    if (ghosts || asks_for("echo")) drawn.echo.resize(size);
+    if (ghosts || tools || beam) drawn.transmittance.resize(size);
+    if (asks_for("coverage")) drawn.coverage.resize(size);
+    const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
+    if (at(drawn.bmode) || at(drawn.echo) || at(drawn.transmittance) || at(drawn.coverage))
+        ultragray::render(*scene_->scene.gaussians, probe, pose, 1, height_, width_, threads, "auto",
+                          {at(drawn.bmode), at(drawn.echo), at(drawn.transmittance), at(drawn.coverage), nullptr, nullptr,
+                           nullptr, nullptr, 0.0f},
+                          {});
+    return drawn;
+}
+
 void View::render_one(const Pose& pose, int threads, unsigned char* pixels) const {
     const Scene& scene = scene_->scene;
     double matrix[16];
     probe_.kernel_pose(scene_->tissue ? scene_->tissue->at_rest(pose) : pose, scene.info.centre_mm, matrix);
     const ProbeGeometry probe = probe_.kernel(height_, beam_);
     const size_t size = size_t(height_) * width_;
-    const auto asked = [&](const char* name) {
-        return std::find(settings_.outputs.begin(), settings_.outputs.end(), name) != settings_.outputs.end();
-    };
-    const bool attenuation = asked("attenuation");
-    std::vector<float> bmode(asked("bmode") ? size : 0), echo(asked("echo") ? size : 0);
-    std::vector<float> transmittance(asked("transmittance") || attenuation ? size : 0),
-        coverage(asked("coverage") ? size : 0);
-    const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
-    if (settings_.outputs != std::vector<std::string>{"labels"})
-        ultragray::render(*scene.gaussians, probe, matrix, 1, height_, width_, threads, "auto",
-                          {at(bmode), at(echo), at(transmittance), at(coverage), nullptr, nullptr, nullptr, nullptr, 0.0f},
-                          {});
-    std::vector<float> taken(attenuation ? size : 0);  // the share of the beam that ends in a pixel
+    Planes drawn = planes(probe, matrix, threads);
+    const ScanView seen(probe_, pose, width_, beam_);
+    const ToolsInView tools(settings_.tools.value_or(std::vector<Tool>{}), seen, height_);
+    tools.draw(drawn);
+    const double ghost = settings_.ghost.value_or(0.0);
+    if (ghost > 0.0 && !drawn.echo.empty() && !drawn.bmode.empty()) add_ghosts(drawn, probe_, height_, width_, ghost);
+    std::vector<float> taken(asks_for("attenuation") ? size : 0);  // the share of the beam that ends in a pixel
     for (size_t k = 0; k < taken.size(); ++k) {
-        const float above = k < size_t(width_) ? 1.0f : transmittance[k - width_];
-        const float share = 1.0f - transmittance[k] / std::max(above, kSpentBeam);
+        const float above = k < size_t(width_) ? 1.0f : drawn.transmittance[k - width_];
+        const float share = 1.0f - drawn.transmittance[k] / std::max(above, kSpentBeam);
         taken[k] = above >= kSpentBeam ? std::clamp(share, 0.0f, 1.0f) : 0.0f;
     }
     for (const std::string& output : settings_.outputs) {
-        std::vector<float> plane = output == "bmode"           ? bmode
-                                   : output == "echo"          ? echo
-                                   : output == "transmittance" ? transmittance
-                                   : output == "coverage"      ? coverage
+        std::vector<float> plane = output == "bmode"           ? drawn.bmode
+                                   : output == "echo"          ? drawn.echo
+                                   : output == "transmittance" ? drawn.transmittance
+                                   : output == "coverage"      ? drawn.coverage
                                    : output == "attenuation"   ? taken
                                                                : labels(probe, matrix, threads);
+        if (is_numbers(output)) tools.mark(plane);
         put(output, plane, pixels);
         const bool bytes = is_numbers(output) || settings_.encoding == Encoding::Uint8;
         pixels += size_t(picture_.height) * picture_.width * (bytes ? 1 : sizeof(float));

@@ -5,6 +5,7 @@
 
 #include "scene_file.hpp"
 #include "tissue.hpp"
+#include "tools.hpp"
 
 namespace ultragray::library {
 
@@ -33,7 +34,9 @@ class View {
         bool inside;
     };
     void render_one(const Pose& pose, int threads, unsigned char* pixels) const;
+    Planes planes(const ProbeGeometry& probe, const double* pose, int threads) const;
     std::vector<float> labels(const ProbeGeometry& probe, const double* pose, int threads) const;
+    bool asks_for(const char* output) const;
     void put(const std::string& output, std::vector<float>& plane, unsigned char* pixels) const;
     void set_tone(std::vector<float>& bmode) const;
     void sharpen(std::vector<float>& bmode) const;
