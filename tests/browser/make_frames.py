@@ -20,6 +20,7 @@ from ultragray.rendering.display import FRAME_RANGE_DB
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import RenderSettings
 
+NEEDLE = {"kind": "needle", "frame": "probe", "tip_mm": [8.0, 0.3, 30.0], "hub_mm": [-20.0, 0.0, 5.0]}
 OUTPUTS = ("bmode", "echo", "transmittance", "coverage")
 
 
@@ -32,6 +33,12 @@ def random_settings(random):
         )
     if random.random() < 0.3:
         settings["slice_thickness_mm"] = float(random.uniform(0.0, 4.0))
+    if random.random() < 0.3:
+        settings["tools"] = [
+            {"kind": "needle", "frame": "probe", "tip_mm": [8.0, 0.3, 30.0], "hub_mm": [-20.0, 0.0, 5.0]}
+        ]
+    if random.random() < 0.2:
+        settings["ghost"] = float(random.uniform(0.1, 1.0))
     if random.random() < 0.5:
         display = {"gain_db": float(random.uniform(-10, 10)), "dynamic_range_db": float(random.uniform(30, 90))}
         display["flip"] = bool(random.random() < 0.5)
