@@ -51,11 +51,13 @@ inline std::string joined(const std::vector<std::string>& words) {
     return text;
 }
 
-// A value as messages show it, cut where it is long.
+// A value as messages show it, cut where it is long. Never what is inside of lists and objects: a file may nest them by the
+// million.
 inline std::string shown(const Json& value) {
     constexpr size_t kMost = 100;
-    std::string text = value.is_string() ? "'" + value.get<std::string>() + "'"
-                                         : value.dump(-1, ' ', false, Json::error_handler_t::replace);
+    if (value.is_array()) return "a list of " + std::to_string(value.size()) + " values";
+    if (value.is_object()) return "an object of " + std::to_string(value.size()) + " entries";
+    std::string text = value.is_string() ? "'" + value.get<std::string>() + "'" : value.dump();
     if (text.size() > kMost) text = text.substr(0, kMost) + "…";
     return text;
 }

@@ -289,6 +289,15 @@ def test_hostile_scene_files_are_one_sentence(library):
             library.ultragray_free_scene(pointer)
         else:
             assert library.ultragray_problem()
+    depth = 500_000
+    nested = json.dumps(
+        {"__metadata__": {"ultragray": '{"format_version": 1, "probe": ' + depth * "[" + depth * "]" + "}"}}
+    )
+    deep = len(nested).to_bytes(8, "little") + nested.encode()
+    assert not library.ultragray_load(deep, len(deep))
+    assert library.ultragray_problem().decode() == (
+        "probe must be an object with a kind, one of convex, linear, phased, radial, steered, got a list of 1 values"
+    )
     for one in cuts:
         assert not library.ultragray_load(one, len(one))
         assert "cut off" in library.ultragray_problem().decode()
