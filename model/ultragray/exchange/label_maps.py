@@ -13,7 +13,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
-from ultragray.scene.info import MAX_LABEL
+from ultragray.scene.info import MAX_LABEL, UNPAINTED
 
 LABEL_MAP_SUFFIXES = (".nii", ".nii.gz")
 MAX_VOXELS = 2**28
@@ -63,8 +63,6 @@ def read_label_map(path: str | Path) -> LabelMap:
 
 
 PAINTED_SUFFIX = ".npz"
-UNPAINTED = 255  # a pixel of which nothing is said
-DEFAULT_WITHIN_MM, MAX_WITHIN_MM = 4.0, 50.0  # how far labels spread
 
 
 class PaintedFrames(NamedTuple):

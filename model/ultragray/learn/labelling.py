@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.label_maps import MAX_WITHIN_MM, UNPAINTED
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import BoolArray, FloatArray, Probe
@@ -28,7 +27,7 @@ from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.frames import render
 from ultragray.rendering.outputs import INTENSITY_SUM, WEIGHT_SUM
 from ultragray.scene.gaussians import GaussianScene
-from ultragray.scene.info import MAX_LABEL
+from ultragray.scene.info import MAX_LABEL, MAX_WITHIN_MM, UNPAINTED
 
 CORRECTION = 4.0  # votes of a painted pixel that would come out otherwise by the frames before
 LEAST_PAINTED = 0.25  # of what a Gaussian shows of itself in a frame: a brush beside it does not reach it

@@ -9,7 +9,6 @@ import numpy as np
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.label_maps import (
-    DEFAULT_WITHIN_MM,
     LABEL_MAP_SUFFIXES,
     PAINTED_SUFFIX,
     parse_names,
@@ -17,7 +16,7 @@ from ultragray.exchange.label_maps import (
     read_painted,
 )
 from ultragray.geometry.registration import load_registration
-from ultragray.scene.info import read_header
+from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray_service.cli.terminal import (
     SCENE_SUFFIX,
     Force,

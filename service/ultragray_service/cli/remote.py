@@ -18,7 +18,7 @@ import numpy as np
 from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions, find_source
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.exchange.label_maps import DEFAULT_WITHIN_MM, parse_names, read_label_map, read_painted
+from ultragray.exchange.label_maps import parse_names, read_label_map, read_painted
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
 from ultragray.geometry.pose import check_poses
@@ -26,7 +26,7 @@ from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.pixels import png_file
 from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
-from ultragray.scene.info import read_header
+from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
 from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options

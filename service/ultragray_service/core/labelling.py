@@ -11,8 +11,8 @@ from typing import Any
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.exchange.label_maps import DEFAULT_WITHIN_MM, MAX_WITHIN_MM
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.scene.info import DEFAULT_WITHIN_MM, MAX_WITHIN_MM
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import Owners
 from ultragray_service.core.life import Life
