@@ -45,6 +45,7 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
         for path in made.iterdir():
             sync(path)
         os.replace(made, folder)
+        sync(folder.parent)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
