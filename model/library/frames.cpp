@@ -129,41 +129,79 @@ size_t View::frame_bytes() const {
 
 void View::render(const double* poses, size_t count, int threads, void* pixels) const {
     auto* out = static_cast<unsigned char*>(pixels);
-    for (size_t c = 0; c < count; ++c)
-        render_one(Pose::read(poses + 16 * c, "poses[" + std::to_string(c) + "]"), threads, out + c * frame_bytes());
+    for (size_t c = 0; c < count; ++c) {
+        const Pose pose = Pose::read(poses + 16 * c, "poses[" + std::to_string(c) + "]");
+        const KernelView view = kernel_view(pose);
+        Planes planes = wanted_planes();
+        const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
+        if (at(planes.bmode) || at(planes.echo) || at(planes.transmittance) || at(planes.coverage))
+            ultragray::render(*scene_->scene.gaussians, view.probe, view.pose, 1, height_, width_, threads, "auto",
+                              {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr,
+                               nullptr, nullptr, nullptr, 0.0f},
+                              {});
+        finish(pose, view, planes, threads, out + c * frame_bytes());
+    }
+}
+
+ultragray_plan View::plan(const double* pose) const {
+    const KernelView view = kernel_view(Pose::read(pose, "pose"));
+    const ProbeGeometry& probe = view.probe;
+    const Planes planes = wanted_planes();
+    ultragray_plan plan{};
+    for (int d = 0; d < 3; ++d) {
+        for (int axis = 0; axis < 3; ++axis) plan.axes[axis][d] = view.pose[4 * d + axis];
+        plan.origin[d] = view.pose[4 * d + 3];
+    }
+    plan.near_cm = probe.near, plan.row_cm = (probe.far - probe.near) / height_, plan.most_cm = probe.cull_far;
+    plan.start = probe.start, plan.span = probe.span;
+    plan.beam[0] = probe.beam.at_focus, plan.beam[1] = probe.beam.focus;
+    plan.beam[2] = probe.beam.slope2, plan.beam[3] = probe.beam.most;
+    plan.fanned = probe.fanned, plan.wrap = probe.wrap;
+    plan.height = height_, plan.width = width_;
+    plan.bmode = !planes.bmode.empty(), plan.echo = !planes.echo.empty();
+    plan.transmittance = !planes.transmittance.empty(), plan.coverage = !planes.coverage.empty();
+    return plan;
+}
+
+void View::finish(const double* pose, const float* drawn, int threads, void* pixels) const {
+    const Pose place = Pose::read(pose, "pose");
+    Planes planes = wanted_planes();
+    for (std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage}) {
+        std::copy_n(drawn, plane->size(), plane->data());
+        drawn += plane->size();
+    }
+    finish(place, kernel_view(place), planes, threads, static_cast<unsigned char*>(pixels));
 }
 
 bool View::asks_for(const char* output) const {
     return std::find(settings_.outputs.begin(), settings_.outputs.end(), output) != settings_.outputs.end();
 }
 
-// The planes that the outputs follow from, and those that tools and ghosts do.
-Planes View::planes(const ProbeGeometry& probe, const double* pose, int threads) const {
+// Room for the planes that the outputs follow from, and for those that tools and ghosts do.
+Planes View::wanted_planes() const {
     const size_t size = size_t(height_) * width_;
     const bool beam = asks_for("transmittance") || asks_for("attenuation");
     const bool ghosts = settings_.ghost.value_or(0.0) > 0.0 && (beam || asks_for("bmode") || asks_for("echo"));
     const bool tools = settings_.tools && !settings_.tools->empty() && asks_for("bmode");
-    Planes drawn;
-    if (ghosts || asks_for("bmode")) drawn.bmode.resize(size);
-    if (ghosts || asks_for("echo")) drawn.echo.resize(size);
-    if (ghosts || tools || beam) drawn.transmittance.resize(size);
-    if (asks_for("coverage")) drawn.coverage.resize(size);
-    const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
-    if (at(drawn.bmode) || at(drawn.echo) || at(drawn.transmittance) || at(drawn.coverage))
-        ultragray::render(*scene_->scene.gaussians, probe, pose, 1, height_, width_, threads, "auto",
-                          {at(drawn.bmode), at(drawn.echo), at(drawn.transmittance), at(drawn.coverage), nullptr, nullptr,
-                           nullptr, nullptr, 0.0f},
-                          {});
-    return drawn;
+    Planes planes;
+    if (ghosts || asks_for("bmode")) planes.bmode.resize(size);
+    if (ghosts || asks_for("echo")) planes.echo.resize(size);
+    if (ghosts || tools || beam) planes.transmittance.resize(size);
+    if (asks_for("coverage")) planes.coverage.resize(size);
+    return planes;
 }
 
-void View::render_one(const Pose& pose, int threads, unsigned char* pixels) const {
-    const Scene& scene = scene_->scene;
-    double matrix[16];
-    probe_.kernel_pose(scene_->tissue ? scene_->tissue->at_rest(pose) : pose, scene.info.centre_mm, matrix);
-    const ProbeGeometry probe = probe_.kernel(height_, beam_);
+View::KernelView View::kernel_view(const Pose& pose) const {
+    KernelView view;
+    const Pose at_rest = scene_->tissue ? scene_->tissue->at_rest(pose) : pose;
+    probe_.kernel_pose(at_rest, scene_->scene.info.centre_mm, view.pose);
+    view.probe = probe_.kernel(height_, beam_);
+    return view;
+}
+
+// From planes to pixels.
+void View::finish(const Pose& pose, const KernelView& view, Planes& drawn, int threads, unsigned char* pixels) const {
     const size_t size = size_t(height_) * width_;
-    Planes drawn = planes(probe, matrix, threads);
     const ScanView seen(probe_, pose, width_, beam_);
     const ToolsInView tools(settings_.tools.value_or(std::vector<Tool>{}), seen, height_);
     tools.draw(drawn);
@@ -181,7 +219,7 @@ void View::render_one(const Pose& pose, int threads, unsigned char* pixels) cons
                                    : output == "transmittance" ? drawn.transmittance
                                    : output == "coverage"      ? drawn.coverage
                                    : output == "attenuation"   ? taken
-                                                               : labels(probe, matrix, threads);
+                                                               : labels(view, threads);
         if (is_numbers(output)) tools.mark(plane);
         put(output, plane, pixels);
         const bool bytes = is_numbers(output) || settings_.encoding == Encoding::Uint8;
@@ -190,11 +228,11 @@ void View::render_one(const Pose& pose, int threads, unsigned char* pixels) cons
 }
 
 // The label whose Gaussians weigh most at each pixel; 0 where none weighs 1/255. Of equals the smallest is taken.
-std::vector<float> View::labels(const ProbeGeometry& probe, const double* pose, int threads) const {
+std::vector<float> View::labels(const KernelView& view, int threads) const {
     const size_t size = size_t(height_) * width_;
     std::vector<float> found(size), heaviest(size), weight(size);
     for (const auto& [label, part] : scene_->scene.parts) {
-        ultragray::render(*part, probe, pose, 1, height_, width_, threads, "auto",
+        ultragray::render(*part, view.probe, view.pose, 1, height_, width_, threads, "auto",
                           {nullptr, nullptr, nullptr, nullptr, weight.data(), nullptr, nullptr, nullptr, 0.0f}, {});
         for (size_t k = 0; k < size; ++k)
             if (weight[k] > heaviest[k] && weight[k] >= kLeastWeightSum) heaviest[k] = weight[k], found[k] = float(label);

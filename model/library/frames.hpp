@@ -6,6 +6,7 @@
 #include "scene_file.hpp"
 #include "tissue.hpp"
 #include "tools.hpp"
+#include "ultragray.h"
 
 namespace ultragray::library {
 
@@ -26,16 +27,25 @@ class View {
     const std::string& json() const { return json_; }
     // Frames of poses [C, 4, 4], mm, row by row. Throws Fault, std::bad_alloc.
     void render(const double* poses, size_t count, int threads, void* pixels) const;
+    // The two halves of a frame whose planes are drawn elsewhere: what they are drawn by, and what follows from them, [H, W]
+    // each, those that the plan wants one after another. Throws Fault, std::bad_alloc.
+    ultragray_plan plan(const double* pose) const;
+    void finish(const double* pose, const float* planes, int threads, void* pixels) const;
 
  private:
+    struct KernelView {  // a pose in the terms of the kernels
+        double pose[16];
+        ProbeGeometry probe;
+    };
     struct Sample {  // of a pixel of a scan-converted picture: a place between four pixels of the frame
         int at, below, beside, nearest;
         float down, right;
         bool inside;
     };
-    void render_one(const Pose& pose, int threads, unsigned char* pixels) const;
-    Planes planes(const ProbeGeometry& probe, const double* pose, int threads) const;
-    std::vector<float> labels(const ProbeGeometry& probe, const double* pose, int threads) const;
+    KernelView kernel_view(const Pose& pose) const;
+    Planes wanted_planes() const;
+    void finish(const Pose& pose, const KernelView& view, Planes& drawn, int threads, unsigned char* pixels) const;
+    std::vector<float> labels(const KernelView& view, int threads) const;
     bool asks_for(const char* output) const;
     void put(const std::string& output, std::vector<float>& plane, unsigned char* pixels) const;
     void set_tone(std::vector<float>& bmode) const;

@@ -70,4 +70,28 @@ int ultragray_render(const ultragray_view* view, const double* poses, size_t cou
     });
 }
 
+const float* ultragray_gaussians(const ultragray_scene* scene) {
+    static_assert(sizeof(ultragray::Gaussian) == 12 * sizeof(float), "the header says so");
+    return reinterpret_cast<const float*>(scene->scene->scene.gaussians->view().gaussians);
+}
+
+const float* ultragray_harmonics(const ultragray_scene* scene) { return scene->scene->scene.gaussians->view().sh; }
+
+int ultragray_plan_of(const ultragray_view* view, const double* pose, ultragray_plan* plan) {
+    return guarded(1, [&] {
+        if (view == nullptr || pose == nullptr || plan == nullptr) throw Fault("view, pose and plan must be given");
+        *plan = view->view.plan(pose);
+        return 0;
+    });
+}
+
+int ultragray_finish(const ultragray_view* view, const double* pose, const float* planes, int threads, void* pixels) {
+    return guarded(1, [&] {
+        if (view == nullptr || pose == nullptr || planes == nullptr || pixels == nullptr)
+            throw Fault("view, pose, planes and pixels must be given");
+        view->view.finish(pose, planes, threads < 1 ? 1 : threads, pixels);
+        return 0;
+    });
+}
+
 const char* ultragray_problem(void) { return problem; }

@@ -46,6 +46,33 @@ ULTRAGRAY_API void ultragray_free_view(ultragray_view *view);
  * Returns 0, or another number where it failed. */
 ULTRAGRAY_API int ultragray_render(const ultragray_view *view, const double *poses, size_t count, int threads, void *pixels);
 
+/* For renderers that draw planes themselves, such as a GPU's: what ultragray_render draws by, and the rest of a frame. */
+
+/* The scene's Gaussians [N, 12] along a space-filling curve: mean (cm, about the scene's centre), standard deviations (cm),
+ * unit quaternion (w, x, y, z), 1 - transmittance, and the distance (cm) beyond which it has no weight. N and the degree of
+ * its harmonics stand in the scene's description. As long as the scene is there. */
+ULTRAGRAY_API const float *ultragray_gaussians(const ultragray_scene *scene);
+/* Their spherical harmonics [N, (degree + 1)^2]. */
+ULTRAGRAY_API const float *ultragray_harmonics(const ultragray_scene *scene);
+
+/* A pose in the terms of docs/physics.md, section 3, about the scene's centre. Booleans are 0 or 1. */
+typedef struct ultragray_plan {
+    double axes[3][3];               /* rows: lateral, elevation, axial; sheared so that parallel lines are axial */
+    double origin[3];                /* cm */
+    double near_cm, row_cm, most_cm; /* depth of the first row's upper edge, height of a row, last depth of a mean */
+    double start, span;              /* line j of W: start + span (j + 1/2) / W, in cm, or radians from the axial axis */
+    double beam[4];                  /* the slice's variance: [0] + [2] (depth - [1])^2, at most [3] */
+    double fanned, wrap;             /* lines run from the origin; the first one follows the last */
+    double height, width;            /* of the planes */
+    double bmode, echo, transmittance, coverage; /* which of them ultragray_finish wants */
+} ultragray_plan;
+
+/* What the planes of a pose [4, 4] are drawn by. Returns 0, or another number where it failed. */
+ULTRAGRAY_API int ultragray_plan_of(const ultragray_view *view, const double *pose, ultragray_plan *plan);
+/* As ultragray_render, of one pose and the planes [height, width] that its plan wants, one after another. */
+ULTRAGRAY_API int ultragray_finish(const ultragray_view *view, const double *pose, const float *planes, int threads,
+                                   void *pixels);
+
 /* What was wrong with the last call of this thread that failed: a sentence, until its next call. */
 ULTRAGRAY_API const char *ultragray_problem(void);
 

@@ -67,6 +67,21 @@ INTERPOLATED = [
 ]
 
 
+PLANES = ("bmode", "echo", "transmittance", "coverage")
+
+
+class Plan(ctypes.Structure):
+    """ultragray_plan."""
+
+    _fields_ = [
+        ("axes", ctypes.c_double * 9),
+        ("origin", ctypes.c_double * 3),
+        *((name, ctypes.c_double) for name in ("near_cm", "row_cm", "most_cm", "start", "span")),
+        ("beam", ctypes.c_double * 4),
+        *((name, ctypes.c_double) for name in ("fanned", "wrap", "height", "width", *PLANES)),
+    ]
+
+
 @pytest.fixture(scope="module")
 def library():
     path, header = c_library()
@@ -82,6 +97,10 @@ def library():
         ("frame_bytes", size, (pointer,)),
         ("free_view", None, (pointer,)),
         ("render", ctypes.c_int, (pointer, pointer, size, ctypes.c_int, pointer)),
+        ("gaussians", ctypes.POINTER(ctypes.c_float), (pointer,)),
+        ("harmonics", ctypes.POINTER(ctypes.c_float), (pointer,)),
+        ("plan_of", ctypes.c_int, (pointer, pointer, ctypes.POINTER(Plan))),
+        ("finish", ctypes.c_int, (pointer, pointer, pointer, ctypes.c_int, pointer)),
         ("problem", text, ()),
     ):
         function = getattr(loaded, f"ultragray_{name}")
@@ -174,6 +193,57 @@ def test_frames_are_those_of_python_byte_for_byte(scene, python_scene, settings)
     for found, expected in both(scene, python_scene, settings, poses_beside(python_scene, 3)):
         assert expected.any()
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("settings", [*EXACT, *PUT_IN], ids=json.dumps)
+def test_planes_drawn_by_a_plan_become_the_frame(scene, python_scene, settings):
+    """The planes are those of the view without tools, ghosts and display settings."""
+    library = scene.library
+    view = library.ultragray_prepare(scene.pointer, json.dumps(settings).encode())
+    [pose], plan = poses_beside(python_scene, 1), Plan()
+    pose = np.ascontiguousarray(pose)
+    assert library.ultragray_plan_of(view, pose.ctypes.data, plan) == 0, scene.problem
+    wanted = [name for name in PLANES if getattr(plan, name)]
+    plain = {name: settings[name] for name in ("probe", "slice_thickness_mm") if name in settings}
+    size = {"height": int(plan.height), "width": int(plan.width)}
+    _, planes = scene.render(plain | size | {"outputs": wanted or ["bmode"], "encoding": "float32"}, pose[None])
+    _, expected = scene.render(settings, pose[None])
+    found = np.zeros_like(expected)
+    code = library.ultragray_finish(view, pose.ctypes.data, planes.ctypes.data, 1, found.ctypes.data)
+    library.ultragray_free_view(view)
+    assert code == 0, scene.problem
+    assert wanted or settings["outputs"] == ["labels"]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_geometry_of_a_plan_is_the_pose_and_the_probe(scene, python_scene):
+    settings = {"probe": {"kind": "steered", "width_mm": 40, "steering_deg": 20, "near_mm": 5, "far_mm": 45}}
+    view = scene.library.ultragray_prepare(scene.pointer, json.dumps(settings | {"height": 80, "width": 10}).encode())
+    pose, plan = np.ascontiguousarray(python_scene.training_poses[3]), Plan()
+    assert scene.library.ultragray_plan_of(view, pose.ctypes.data, plan) == 0
+    scene.library.ultragray_free_view(view)
+    axes, centre = np.array(plan.axes).reshape(3, 3), np.array(python_scene.info.centre_mm)
+    angle = np.radians(20.0)  # lateral and axial become those along which a steered line is upright
+    np.testing.assert_allclose(axes[0], pose[:3, 0] - np.tan(angle) * pose[:3, 2], atol=1e-6)
+    np.testing.assert_allclose(axes[1], pose[:3, 1], atol=1e-6)
+    np.testing.assert_allclose(axes[2], pose[:3, 2] / np.cos(angle), atol=1e-6)
+    np.testing.assert_allclose(plan.origin, (pose[:3, 3] - centre) / 10.0, atol=1e-6)
+    assert (plan.near_cm, plan.row_cm, plan.most_cm) == pytest.approx((0.5, 0.05, 4.45))
+    assert (plan.start, plan.span, plan.fanned, plan.wrap) == pytest.approx((-2.0, 4.0, 0.0, 0.0))
+
+
+def test_gaussians_are_those_of_the_scene(scene, python_scene):
+    count, terms = len(python_scene.means), python_scene.shN.shape[1] + 1
+    gaussians = np.ctypeslib.as_array(scene.library.ultragray_gaussians(scene.pointer), (count, 12))
+    harmonics = np.ctypeslib.as_array(scene.library.ultragray_harmonics(scene.pointer), (count, terms))
+    means = python_scene.means.numpy()
+    order, given = np.lexsort(gaussians[:, :3].T), np.lexsort(means.T)
+    np.testing.assert_array_equal(gaussians[order, :3], means[given])
+    np.testing.assert_allclose(gaussians[order, 3:6], np.exp(python_scene.scales.numpy()[given]), rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(gaussians[:, 6:10], axis=1), 1.0, rtol=1e-5)
+    absorb = 1.0 / (1.0 + np.exp(python_scene.transmittances.numpy()[given]))
+    np.testing.assert_allclose(gaussians[order, 10], absorb, rtol=1e-5)
+    np.testing.assert_array_equal(harmonics[order, 0], python_scene.sh0.numpy()[given].ravel())
 
 
 @pytest.mark.parametrize("settings", INTERPOLATED, ids=json.dumps)
