@@ -51,6 +51,7 @@ export default defineConfig({
   },
   server: {
     host: "127.0.0.1",
+    fs: { allow: [".."] }, // poses are those of `browser`
     proxy: { "/v1": { target: service, ws: true, changeOrigin: true, headers: { origin: service } } },
   },
 });

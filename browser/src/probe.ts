@@ -5,7 +5,8 @@
  * Events: `frame` (detail: the Frame and its pose), `problem` (detail: an Error).
  */
 
-import { Scene, type Frame, type Pose, type Settings } from "./scene.js";
+import { IDENTITY, type Pose } from "./pose.js";
+import { Scene, type Frame, type Settings } from "./scene.js";
 import { moved, type Motion } from "./steering.js";
 
 const STEP_MM = 0.5;
@@ -37,7 +38,7 @@ export class UltragrayProbe extends HTMLElement {
 
   #canvas = document.createElement("canvas");
   #scene: Promise<Scene> | undefined;
-  #pose: Pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+  #pose: Pose = IDENTITY;
   #settings: Settings = {};
   #wanted = false;
   #drawing = false;

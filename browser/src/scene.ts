@@ -1,6 +1,7 @@
 /** A scene whose frames are rendered here, or by a service: both behind `Scene`, so that a page changes by one word. */
 
 import type { components } from "./generated/openapi.js";
+import type { Pose } from "./pose.js";
 import type { Answer, Request } from "./worker.js";
 
 type Schemas = components["schemas"];
@@ -9,9 +10,6 @@ type Schemas = components["schemas"];
 export type Settings = Partial<Omit<Schemas["RenderSettings"], "registration">>;
 /** Of each output as shares (uint8 0 to 255, float32 0 to 1), labels as numbers. */
 export type Output = string;
-
-/** A pose: a matrix [4, 4] of 16 numbers, row by row, from the probe to the scene, mm. */
-export type Pose = readonly number[];
 
 /** Where the pixels of a picture lie in the image plane; see Picture of the HTTP reference. */
 export type Picture = Schemas["Picture"];
@@ -28,7 +26,8 @@ export interface FrameInfo {
 export class Frame {
   constructor(
     readonly info: FrameInfo,
-    private readonly bytes: Uint8Array<ArrayBuffer>,
+    /** All outputs, one after another. */
+    readonly bytes: Uint8Array<ArrayBuffer>,
   ) {}
 
   /** One output, [height, width] row by row. Throws for one that was not asked for. */

@@ -25,7 +25,7 @@ PATHS = (
     "/v1/scenes?page_size={}", "/v1/scenes?page_token={}", "/v1/datasets/{}", "/v1/datasets/{}/poses",
     "/v1/datasets/{}/contact-sheet", "/v1/datasets?page_token={}", "/v1/jobs/{}", "/v1/jobs/{}/log",
     "/v1/jobs/{}/artifacts/{}", "/v1/jobs/{}/events", "/v1/jobs?state={}", "/v1/jobs?page_token={}", "/v1/{}",
-    "/assets/{}",
+    "/assets/{}", "/package/{}",
 )  # fmt: skip
 
 

@@ -168,6 +168,7 @@ OPERATIONS = (
         "GET /favicon.svg",
         "GET /licences.txt",
         "GET /assets/{path:path}",
+        "GET /package/{path:path}",
     ),
 )
 

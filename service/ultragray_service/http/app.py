@@ -27,6 +27,7 @@ from starlette.types import Scope
 from ultragray import __version__
 from ultragray.contract import to_dict
 from ultragray.errors import UltragrayError
+from ultragray.exchange.page import ASSETS as PACKAGE_FOLDER
 from ultragray.geometry.probe import Probe
 from ultragray.learn.training.config import PRESETS, TrainingConfig
 from ultragray.rendering.volumes import SliceSettings
@@ -78,9 +79,9 @@ def add_docs(app: FastAPI) -> None:
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
 ASSETS_PATH = "/assets"
+PACKAGE_PATH = "/package"  # of @ultragray/web, by which a page renders frames itself
 _PAGE_NAME = "index.html"
 _BESIDE = {"favicon.svg": "image/svg+xml", "licences.txt": "text/plain"}  # the page: file name and media type
-CONSOLE_PATHS = ("/", *(f"/{name}" for name in _BESIDE))  # and below ASSETS_PATH: a page cannot send a key for itself
 _HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
 _POLICY = (
     "default-src 'self'",
@@ -98,6 +99,12 @@ _PAGE_HEADERS = {
     "Cache-Control": "no-cache",
 }
 _ASSET_HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "public, max-age=31536000, immutable"}
+# A worker has the policy of its own file: it alone compiles WebAssembly, which the page may not.
+_PACKAGE_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+}
 _NOT_BUILT = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
@@ -114,13 +121,19 @@ client.</p>
 
 
 def add_console(
-    app: FastAPI, folder: Path = CONSOLE_FOLDER, *, token_origin: Callable[[], str | None] = lambda: None
+    app: FastAPI,
+    folder: Path = CONSOLE_FOLDER,
+    package: Path = PACKAGE_FOLDER,
+    *,
+    token_origin: Callable[[], str | None] = lambda: None,
 ) -> None:
     """Serves the console in `folder`, which may be built while the service runs; without it, a page that says how.
 
-    `token_origin`: the one other site that the page may ask, for the tokens of those who sign in there.
+    `package`: the modules of @ultragray/web, which may be missing. `token_origin`: the one other site that the page may
+    ask, for the tokens of those who sign in there.
     """
-    app.mount(ASSETS_PATH, GZipMiddleware(_Assets(directory=folder / "assets", check_dir=False), minimum_size=1024))
+    app.mount(ASSETS_PATH, GZipMiddleware(_Files(folder / "assets", _ASSET_HEADERS), minimum_size=1024))
+    app.mount(PACKAGE_PATH, GZipMiddleware(_Files(package, _PACKAGE_HEADERS), minimum_size=1024))
 
     @app.api_route("/", methods=["GET", "HEAD"], include_in_schema=False)
     async def console(request: Request) -> Response:
@@ -156,15 +169,19 @@ def _headers(request: Request, token_origin: str | None) -> Mapping[str, str]:
     return {**NOT_FRAMED, **_PAGE_HEADERS, "Content-Security-Policy": policy}
 
 
-class _Assets(StaticFiles):
-    """Files whose names change with their content."""
+class _Files(StaticFiles):
+    """The files of a folder, all with the same headers."""
+
+    def __init__(self, folder: Path, headers: Mapping[str, str]) -> None:
+        super().__init__(directory=folder, check_dir=False)
+        self._headers = headers
 
     async def check_config(self) -> None:
         """No folder yet is no mistake: each file is not found."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
-        response.headers.update(_ASSET_HEADERS)
+        response.headers.update(self._headers)
         return response
 
 

@@ -17,9 +17,14 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def page(folder):
+def package(tmp_path):
+    return tmp_path / "package"
+
+
+@pytest.fixture
+def page(folder, package):
     app = FastAPI()
-    add_console(app, folder)
+    add_console(app, folder, package)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
 
 
@@ -56,6 +61,18 @@ def test_the_page_is_asked_for_again_and_its_files_are_kept(page, folder):
     assert script.text == "export {};" * 1000
     assert get(page, "/favicon.svg").headers["content-type"] == "image/svg+xml"
     assert get(page, "/licences.txt").text == "MIT"
+
+
+def test_the_renderer_of_pages_is_asked_for_again_and_compiles_webassembly_in_its_worker_alone(page, package):
+    assert get(page, "/package/worker.js").status_code == 404
+    package.mkdir()
+    (package / "worker.js").write_text("export {};")
+    (package / "ultragray.wasm").write_bytes(bytes(5000))
+    worker = get(page, "/package/worker.js")
+    assert worker.headers["cache-control"] == "no-cache"
+    assert "script-src 'self' 'wasm-unsafe-eval';" in worker.headers["content-security-policy"]
+    assert get(page, "/package/worker.js", if_none_match=worker.headers["etag"]).status_code == 304
+    assert get(page, "/package/ultragray.wasm").headers["content-type"] == "application/wasm"
 
 
 @pytest.mark.parametrize("path", ["/assets/%2e%2e/index.html", "/assets/%2e%2e%2findex.html"])

@@ -10,6 +10,8 @@ export interface Frame {
   header: FrameHeader;
   /** uint8, one output after another, each height × width. */
   pixels: Uint8Array<ArrayBuffer>;
+  /** The settings that were asked for, as JSON; of another program's frame there are none. */
+  asked?: string | undefined;
   /** From asking to having it. */
   roundTrip_ms: number;
   /** When it came, by the clock of the page. */
@@ -176,7 +178,8 @@ export class FrameStream {
       this.#acknowledge(frame.header.sequence);
       if (frame.header.sequence < this.#answered) return; // a newer pose was refused
       this.#silent_ms = Math.max(SILENT_MS.first, 2 * frame.roundTrip_ms);
-      this.#takenSettings = this.#asked.get(frame.header.sequence) ?? "";
+      frame.asked = this.#asked.get(frame.header.sequence);
+      this.#takenSettings = frame.asked ?? "";
       this.#settle(frame.header.sequence);
       this.events.frame(frame);
     }

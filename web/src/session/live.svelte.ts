@@ -4,6 +4,7 @@ import { settingsAgain, type StreamSettings } from "../api/contract";
 import { type Frame, FrameStream, type Refusal, type StreamSummary, WatchStream } from "../api/stream";
 import type { Pose } from "../geometry/pose";
 import { service } from "../page/service.svelte";
+import { areAlike, type Difference, differenceOf, frameSource, isLocal, LocalFrames } from "./local.svelte";
 import type { Session } from "./session.svelte";
 
 const KEPT = 240; // frames
@@ -130,6 +131,7 @@ function sameProbe(a: object, b: object): boolean {
 
 const RATES_EVERY_MS = 500;
 const SCENE_ASKED_AGAIN_MS = 3000;
+const COMPARED = 8; // frames that wait for those of the other source
 const FAILURES_SAID = 5; // in a row; by then the state of the service is known
 
 /** The live frames of a session: at most one a screen refresh, the newest, with the rate they come at. */
@@ -147,6 +149,14 @@ export class LiveView {
   following = $state.raw<Following | null>(null);
   /** The one that was followed last, and why it is not any more. */
   unfollowed = $state.raw<{ stream: StreamSummary; why: "ended" | "steered" } | null>(null);
+  /** Those that the page renders itself. */
+  readonly local: LocalFrames;
+  /** Whether frames come, from wherever they are wanted. */
+  readonly arrives = $derived.by(() => (frameSource.chosen !== "page" && this.connected) || (frameSource.chosen !== "service" && this.local.ready));
+  /** Of the page's frame and the service's, for the newest view that both have rendered. */
+  difference = $state.raw<Difference | null>(null);
+  #recent: Frame[] = [];
+  #newest: Frame | null = null;
   #latency = new Latency();
   #stream: FrameStream;
   #arrived: Frame | null = null;
@@ -163,13 +173,17 @@ export class LiveView {
   ) {
     this.#stream = new FrameStream(session.name, {
       frame: (frame) => {
-        if (this.following === null || this.following.renderedHere) this.#take(frame);
+        if (this.following?.renderedHere) this.#take(frame);
+        else if (this.following === null && frameSource.chosen !== "page") this.#choose(frame);
       },
       refused: (refusal) => (this.refusal = refusal),
       connected: (yes) => {
         this.connected = yes;
         this.#failures = yes ? 0 : this.#failures + 1;
       },
+    });
+    this.local = new LocalFrames(session.scene, (frame) => {
+      if (this.following === null && frameSource.chosen !== "service") this.#choose(frame);
     });
     this.#timer = setInterval(() => this.#measure(), RATES_EVERY_MS);
     // Until the scene is known as it is now, and while the stream is lost, the service is asked what is the matter.
@@ -192,7 +206,9 @@ export class LiveView {
 
   /** Asks for the frame of where the probe is now; not while another program's frames are shown. */
   ask(settings: StreamSettings): void {
-    if (this.following === null) this.#stream.ask(this.session.pose, settings);
+    if (this.following !== null) return;
+    if (frameSource.chosen !== "page") this.#stream.ask(this.session.pose, settings);
+    if (frameSource.chosen !== "service") this.local.ask(this.session.pose, settings);
   }
 
   /** Shows the frames of another program's stream, and puts the probe where they are. */
@@ -219,16 +235,29 @@ export class LiveView {
 
   #close(): void {
     this.following?.close();
+    this.local.close();
     this.#stream.close();
     clearInterval(this.#timer);
     cancelAnimationFrame(this.#request);
   }
 
+  /** Takes a frame of the page's own unless a newer one is there; of one view, the service's: it tells more. */
+  #choose(frame: Frame): void {
+    const twin = this.#recent.find((other) => isLocal(other) !== isLocal(frame) && areAlike(other, frame));
+    if (twin !== undefined) this.difference = differenceOf(frame, twin);
+    this.#recent = [frame, ...this.#recent.slice(0, COMPARED - 1)];
+    if (!isLocal(frame)) this.local.compareFile(frame.header.scene_sha256);
+    const isOlder = this.#newest !== null && askedAt_ms(frame) < askedAt_ms(this.#newest);
+    if (isLocal(frame) ? isOlder || twin !== undefined : isOlder && twin !== this.#newest) return;
+    this.#newest = frame;
+    this.#take(frame);
+  }
+
   #take(frame: Frame): void {
     this.#arrived = frame;
     this.#arrived_ms = performance.now();
-    this.refusal = null;
-    this.session.scene.rendered(frame.header.scene_sha256);
+    if (!isLocal(frame)) this.session.scene.rendered(frame.header.scene_sha256);
+    if (!isLocal(frame) || frameSource.chosen === "page") this.refusal = null;
     this.#latency.dropped(frame.header.dropped); // also those of a frame that another one replaces before it is shown
     if (this.#request === 0) this.#request = requestAnimationFrame(() => this.#show());
   }
@@ -252,4 +281,8 @@ export class LiveView {
     this.#shown = 0;
     this.#since_ms = now;
   }
+}
+
+function askedAt_ms({ came_ms, roundTrip_ms }: Frame): number {
+  return came_ms - roundTrip_ms;
 }

@@ -56,6 +56,12 @@ const sentences: Translated<Words> = {
   },
   scenes: { audit: { span: (hours) => (hours === 1 ? "eine Stunde" : hours === 24 ? "ein Tag" : `${hours / 24} Tage`) } },
   session: {
+    local: {
+      difference: (largest, mean) =>
+        largest === 0
+          ? "Ihr Bild ist das des Dienstes, Pixel für Pixel."
+          : `Ihr Bild und das des Dienstes unterscheiden sich um höchstens ${largest} von 255 Graustufen, im Mittel um ${mean}.`,
+    },
     link: {
       refused: (values) =>
         `Die Adresse enthält ${values.length === 1 ? "einen Wert, der nicht verwendbar ist" : "Werte, die nicht verwendbar sind"}; ohne sie geöffnet: ${values.join(", ")}.`,

@@ -84,6 +84,15 @@ const sentences = {
       thereAre: (count: number): string => (count === 1 ? "There is" : "There are"),
       unreadable: (detail: string): string => `This scene file cannot be read: ${detail}`,
     },
+    local: {
+      tooLarge: (mb: string, most: string): string => `The scene file has ${mb} MB. A page renders scenes of at most ${most} MB.`,
+      fetching: (mb: string): string => `The scene file, ${mb} MB, is being fetched …`,
+      here: (mb: string): string => `The page has the scene file, ${mb} MB, and renders the image itself.`,
+      difference: (largest: number, mean: string): string =>
+        largest === 0
+          ? "Its frame is the service's, pixel by pixel."
+          : `Its frame and the service's differ by at most ${largest} of 255 grey levels, by ${mean} on average.`,
+    },
   },
   space: {
     pressed: (mm: string): string => `pressed ${mm} mm`,
