@@ -12,12 +12,13 @@ interface Exports {
   ultragray_view_info(view: number): number;
   ultragray_frame_bytes(view: number): number;
   ultragray_free_view(view: number): void;
-  ultragray_render(view: number, poses: number, count: number, threads: number, pixels: number): number;
+  ultragray_render(view: number, poses: number, count: number, threads: number, pixels: number, extrapolations: number): number;
   ultragray_problem(): number;
 }
 
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
 const POSE_BYTES = 128;
+const FIGURES = 5; // of ultragray_extrapolation, a double each
 
 /** One instance of the module, with a memory of its own. Whatever is wrong with an input is an Error, in a sentence. */
 export class Library {
@@ -59,13 +60,18 @@ export class Library {
     this.exports.ultragray_free_view(view);
   }
 
-  /** The frame of a pose [4, 4], row by row. */
-  render(view: number, pose: readonly number[]): Uint8Array<ArrayBuffer> {
+  /** The frame of a pose [4, 4], row by row, and its ultragray_extrapolation, field by field; NaN: not known. */
+  render(view: number, pose: readonly number[]): { pixels: Uint8Array<ArrayBuffer>; figures: Float64Array } {
     const size = this.exports.ultragray_frame_bytes(view);
-    return this.#with(new Uint8Array(POSE_BYTES + size), (at) => {
+    const before = POSE_BYTES + 8 * FIGURES;
+    return this.#with(new Uint8Array(before + size), (at) => {
       new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
-      if (this.exports.ultragray_render(view, at, 1, 1, at + POSE_BYTES) !== 0) this.#fail();
-      return new Uint8Array(this.exports.memory.buffer).slice(at + POSE_BYTES, at + POSE_BYTES + size);
+      if (this.exports.ultragray_render(view, at, 1, 1, at + before, at + POSE_BYTES) !== 0) this.#fail();
+      const { buffer } = this.exports.memory;
+      return {
+        pixels: new Uint8Array(buffer).slice(at + before, at + before + size),
+        figures: new Float64Array(buffer, at + POSE_BYTES, FIGURES).slice(),
+      };
     });
   }
 

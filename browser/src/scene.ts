@@ -8,19 +8,27 @@ type Schemas = components["schemas"];
 
 /** What is rendered, as every door of the service takes it. Left out: as the scene has it. */
 export type Settings = Partial<Omit<Schemas["RenderSettings"], "registration">>;
-/** Of each output as shares (uint8 0 to 255, float32 0 to 1), labels as numbers. */
+/** Of each output as shares (uint8 0 to 255, floats 0 to 1), labels as numbers. */
 export type Output = string;
+
+/** How far a frame extrapolates from what its scene was trained on, and how much to trust it; null: not known. */
+export type Extrapolation = Schemas["Extrapolation"];
+const FIGURES = ["distance_mm", "angle_deg", "confidence", "supported_share", "contact_share"] as const; // as the library has them
 
 /** Where the pixels of a picture lie in the image plane; see Picture of the HTTP reference. */
 export type Picture = Schemas["Picture"];
 
 export interface FrameInfo {
   outputs: Output[];
-  encoding: "uint8" | "float32";
+  encoding: "uint8" | "float32" | "float16";
   height: number;
   width: number;
   picture: Picture;
 }
+
+const BYTES = { uint8: 1, float32: 4, float16: 2 };
+/** A number from 0 on that has the 16 bits of IEEE 754. */
+const widened = (bits: number): number => (bits < 1024 ? bits / 2 ** 24 : 2 ** ((bits >> 10) - 25) * (1024 + (bits & 1023)));
 
 /** The pixels of one pose. */
 export class Frame {
@@ -28,6 +36,7 @@ export class Frame {
     readonly info: FrameInfo,
     /** All outputs, one after another. */
     readonly bytes: Uint8Array<ArrayBuffer>,
+    readonly extrapolation: Extrapolation,
   ) {}
 
   /** One output, [height, width] row by row. Throws for one that was not asked for. */
@@ -36,9 +45,12 @@ export class Frame {
     const count = height * width;
     let at = 0;
     for (const one of outputs) {
-      const wide = encoding === "float32" && one !== "labels";
-      if (one === output) return wide ? new Float32Array(this.bytes.slice(at, at + 4 * count).buffer) : this.bytes.subarray(at, at + count);
-      at += wide ? 4 * count : count;
+      const wide = one === "labels" ? 1 : BYTES[encoding];
+      const part = this.bytes.subarray(at, at + wide * count);
+      at += wide * count;
+      if (one !== output) continue;
+      if (wide === 1) return part;
+      return wide === 4 ? new Float32Array(part.slice().buffer) : Float32Array.from(new Uint16Array(part.slice().buffer), widened);
     }
     throw new Error(`the frame has ${outputs.join(", ")}, not ${output}`);
   }
@@ -86,7 +98,9 @@ class LocalScene implements Scene {
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
     const { view, info } = await this.#view(JSON.stringify(settings));
-    return new Frame(info, await this.renderer.ask<Uint8Array<ArrayBuffer>>({ act: "render", view, pose: checked(pose) }));
+    const frame = await this.renderer.ask<{ pixels: Uint8Array<ArrayBuffer>; figures: Float64Array }>({ act: "render", view, pose: checked(pose) });
+    const figures = FIGURES.map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
+    return new Frame(info, frame.pixels, Object.fromEntries(figures) as Extrapolation);
   }
 
   close(): void {
@@ -207,7 +221,7 @@ class ServedScene implements Scene {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
     const begin = Math.ceil((4 + length) / 8) * 8;
-    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin)));
+    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin), header.extrapolation));
   }
 
   #settle(sequence: number): Waiting | undefined {

@@ -17,7 +17,7 @@ async function open(): Promise<Library> {
   return Library.of(await WebAssembly.compile(await answer.arrayBuffer()));
 }
 
-async function done(request: Request): Promise<unknown> {
+async function done(request: Request, transfer: Transferable[]): Promise<unknown> {
   library ??= open();
   const opened = await library;
   switch (request.act) {
@@ -25,8 +25,11 @@ async function done(request: Request): Promise<unknown> {
       return opened.load(request.bytes);
     case "prepare":
       return opened.prepare(request.scene, request.settings);
-    case "render":
-      return opened.render(request.view, request.pose);
+    case "render": {
+      const frame = opened.render(request.view, request.pose);
+      transfer.push(frame.pixels.buffer);
+      return frame;
+    }
     case "freeView":
       return opened.freeView(request.view);
   }
@@ -34,11 +37,11 @@ async function done(request: Request): Promise<unknown> {
 
 onmessage = async ({ data: { number, request } }: MessageEvent<{ number: number; request: Request }>) => {
   const answer: Answer = { number };
+  const transfer: Transferable[] = [];
   try {
-    answer.result = await done(request);
+    answer.result = await done(request, transfer);
   } catch (error) {
     answer.problem = error instanceof Error ? error.message : String(error);
   }
-  const pixels = answer.result instanceof Uint8Array ? [answer.result.buffer] : [];
-  postMessage(answer, { transfer: pixels });
+  postMessage(answer, { transfer });
 };

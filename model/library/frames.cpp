@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "../kernels/render.hpp"
+#include "random.hpp"
 
 namespace ultragray::library {
 namespace {
@@ -12,28 +13,50 @@ namespace {
 constexpr double kFrameRangeDb = 60.0;
 constexpr float kLeastWeightSum = 1.0f / 255.0f;  // a label with less is not seen
 constexpr float kSpentBeam = 1e-4f;               // nothing can be said of what is taken from less
-const std::vector<std::string> kOutputs = {"bmode", "echo", "transmittance", "coverage", "attenuation", "labels"};
+const std::vector<std::string> kOutputs = {"bmode",       "echo",   "transmittance", "coverage",
+                                           "attenuation", "labels", "uncertainty"};
 
 bool is_numbers(const std::string& output) { return output == "labels"; }
+bool tells_support(const std::string& output) { return output == "coverage" || output == "uncertainty"; }
+
+// Of a pixel; 0 for an encoding that is left to a service.
+size_t bytes_of(Encoding encoding) {
+    switch (encoding) {
+        case Encoding::Uint8:
+            return 1;
+        case Encoding::Float16:
+            return 2;
+        case Encoding::Float32:
+            return 4;
+        case Encoding::Png:
+        case Encoding::Jpeg:
+        case Encoding::Npz:
+            return 0;
+    }
+    throw Fault("there is no such encoding");
+}
+
+const char* word_of(Encoding encoding) {
+    return encoding == Encoding::Uint8 ? "uint8" : encoding == Encoding::Float16 ? "float16" : "float32";
+}
 
 // What this library leaves to a service.
 void check_local(const RenderSettings& settings, const SceneInfo& info) {
     const auto refuse = [](const std::string& field, const std::string& reason) { throw Fault(field + " " + reason); };
-    if (settings.min_confidence)
-        refuse("min_confidence", "can be judged by a service alone: local frames tell no confidence");
     if (settings.registration) refuse("registration", "is kept by a service: local poses are probe to scene");
-    if (settings.encoding != Encoding::Uint8 && settings.encoding != Encoding::Float32)
-        refuse("encoding", "must be uint8 or float32 for local frames");
-    if (settings.contact) refuse("contact", "can be shown by a service alone");
-    if (settings.speckle != Speckle::Off) refuse("speckle", "can be drawn by a service alone");
-    if (settings.display &&
-        (!settings.display->gain_db_between.empty() || !settings.display->dynamic_range_db_between.empty()))
-        refuse("display", "can be drawn at random by a service alone");
+    if (bytes_of(settings.encoding) == 0) refuse("encoding", "must be uint8, float32 or float16 for local frames");
+    if (settings.min_confidence && !info.confidence)
+        refuse("min_confidence", "needs a scene that knows the confidence of its frames; this one was trained without");
+    if (settings.speckle == Speckle::Natural && !info.speckle)
+        refuse("speckle", "natural needs a scene whose training fitted the speckle of its frames; this one has none");
     for (const std::string& output : settings.outputs) {
         if (std::find(kOutputs.begin(), kOutputs.end(), output) == kOutputs.end())
             refuse("outputs", "must be some of " + joined(kOutputs) + ", got '" + output + "'");
         if (is_numbers(output) && info.label_names.empty() && (!settings.tools || settings.tools->empty()))
             refuse("outputs", "may name labels only for a scene whose Gaussians carry labels, or for frames with tools");
+        if (output == "uncertainty" && !(info.confidence && info.confidence->uncertainty))
+            refuse("outputs",
+                   "may name uncertainty only for a scene whose training fitted its uncertainty; this one has none");
     }
 }
 
@@ -64,6 +87,11 @@ std::optional<ElevationBeam> beam_of(const RenderSettings& settings, const Scene
     return beam;
 }
 
+// A frame whose confidence is not known has none.
+bool is_confident(const Extrapolation& found, const std::optional<double>& least) {
+    return !least || (std::isnan(found.confidence) ? 0.0 : found.confidence) >= *least;
+}
+
 int rows_shown(const Display& display, const Probing& probe, int height) {
     if (!display.depth_mm) return height;
     const double share = (probe.face_mm + *display.depth_mm - probe.near_mm) / probe.length_mm();
@@ -74,7 +102,31 @@ unsigned char rounded(float value) {
     return static_cast<unsigned char>(std::nearbyint(std::clamp(value, 0.0f, 1.0f) * 255.0f));
 }
 
+// The nearest of the 16 bits of IEEE 754, of two the even one, of a number from 0 to 65504.
+uint16_t halved(float value) {
+    constexpr float kLeastNormal = 1.0f / 16384.0f, kSubnormals = 16777216.0f;
+    if (value < kLeastNormal) return uint16_t(std::nearbyint(value * kSubnormals));
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return uint16_t((bits + 0xfff + (bits >> 13 & 1) - (uint32_t(127 - 15) << 23)) >> 13);
+}
+
 }  // namespace
+
+LoadedScene::LoadedScene(Scene read) : scene(std::move(read)) {
+    const SceneInfo& info = scene.info;
+    if (info.tissue_shares) tissue_ = std::make_unique<FollowingTissue>(scene);
+    if (info.speckle) speckle = std::make_unique<SpeckleOfScene>(*info.speckle, poses_at_rest());
+    if (!info.probe || scene.training_poses.empty()) return;
+    views = std::make_unique<TrainingViews>(scene.training_poses, Probing::of(*info.probe));
+    views_at_rest = std::make_unique<TrainingViews>(poses_at_rest(), Probing::of(*info.probe));
+}
+
+const Skin& LoadedScene::skin() const {
+    const std::lock_guard<std::mutex> guard(skin_lock_);
+    if (!skin_) skin_ = std::make_unique<Skin>(scene.training_poses, scene.info.probe);
+    return *skin_;
+}
 
 View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings)
     : scene_(std::move(scene)),
@@ -88,25 +140,15 @@ View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings
     const Probing shown = probe_.ending_at(probe_.near_mm + double(rows_) / height_ * probe_.length_mm());
     picture_ = display_.pixel_mm ? Picture::of_plane(shown, *display_.pixel_mm) : Picture::of_frame(shown, rows_, width_);
     if (display_.pixel_mm) samples_ = samples();
-    const bool toned = display_.gain_db != 0.0 || display_.dynamic_range_db != kFrameRangeDb ||
-                       std::any_of(display_.tgc_db.begin(), display_.tgc_db.end(), [](double gain) { return gain != 0.0; });
-    for (int row = 0; toned && row < rows_; ++row) {
-        double gain = display_.gain_db;
-        const std::vector<double>& points = display_.tgc_db;
-        if (!points.empty()) {
-            const double place = (row + 0.5) / rows_ * double(points.size() - 1);
-            const size_t low = std::min(size_t(place), points.size() - 1), high = std::min(low + 1, points.size() - 1);
-            gain += points[low] + (place - double(low)) * (points[high] - points[low]);
-        }
-        const double scale = kFrameRangeDb / display_.dynamic_range_db;
-        lift_.push_back(float(1.0 - scale) + float(gain) / float(display_.dynamic_range_db));
-    }
+    if (settings_.contact) scene_->skin();
+    if (settings_.speckle == Speckle::Natural)
+        speckle_ = std::make_unique<SpeckleSamples>(scene_->speckle->model(), probe_, height_, width_);
     if (display_.flip) {
         picture_.first[0] += (picture_.width - 1) * picture_.step[0];
         picture_.step[0] = -picture_.step[0];
     }
     json_ = Json{{"outputs", settings_.outputs},
-                 {"encoding", settings_.encoding == Encoding::Uint8 ? "uint8" : "float32"},
+                 {"encoding", word_of(settings_.encoding)},
                  {"rendered_height", height_},
                  {"rendered_width", width_},
                  {"height", picture_.height},
@@ -120,37 +162,44 @@ View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings
                 .dump();
 }
 
+size_t View::bytes_per_pixel(const std::string& output) const {
+    return is_numbers(output) ? 1 : bytes_of(settings_.encoding);
+}
+
 size_t View::frame_bytes() const {
     size_t bytes = 0;
-    for (const std::string& output : settings_.outputs)
-        bytes += is_numbers(output) || settings_.encoding == Encoding::Uint8 ? 1 : sizeof(float);
+    for (const std::string& output : settings_.outputs) bytes += bytes_per_pixel(output);
     return bytes * size_t(picture_.height) * size_t(picture_.width);
 }
 
-void View::render(const double* poses, size_t count, int threads, void* pixels) const {
+void View::render(const double* poses, size_t count, int threads, void* pixels, Extrapolation* extrapolations) const {
     auto* out = static_cast<unsigned char*>(pixels);
+    const bool judged = extrapolations != nullptr || settings_.min_confidence;
     for (size_t c = 0; c < count; ++c) {
-        const Pose pose = Pose::read(poses + 16 * c, "poses[" + std::to_string(c) + "]");
-        const KernelView view = kernel_view(pose);
-        Planes planes = wanted_planes();
+        const std::string name = "poses[" + std::to_string(c) + "]";
+        const Sight sight = sight_of(Pose::read(poses + 16 * c, name), name);
+        Extrapolation found{};
+        if (judged) found = judged_by_pose(sight);
+        Planes planes = wanted_planes(judged);
         const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
         if (at(planes.bmode) || at(planes.echo) || at(planes.transmittance) || at(planes.coverage))
-            ultragray::render(*scene_->scene.gaussians, view.probe, view.pose, 1, height_, width_, threads, "auto",
+            ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
                               {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr,
                                nullptr, nullptr, nullptr, 0.0f},
                               {});
-        finish(pose, view, planes, threads, out + c * frame_bytes());
+        finish(sight, planes, threads, judged ? &found : nullptr, out + c * frame_bytes());
+        if (extrapolations) extrapolations[c] = found;
     }
 }
 
 ultragray_plan View::plan(const double* pose) const {
-    const KernelView view = kernel_view(Pose::read(pose, "pose"));
-    const ProbeGeometry& probe = view.probe;
-    const Planes planes = wanted_planes();
+    const Sight sight = sight_of(Pose::read(pose, "pose"), "pose");
+    const ProbeGeometry& probe = sight.geometry;
+    const Planes planes = wanted_planes(true);
     ultragray_plan plan{};
     for (int d = 0; d < 3; ++d) {
-        for (int axis = 0; axis < 3; ++axis) plan.axes[axis][d] = view.pose[4 * d + axis];
-        plan.origin[d] = view.pose[4 * d + 3];
+        for (int axis = 0; axis < 3; ++axis) plan.axes[axis][d] = sight.matrix[4 * d + axis];
+        plan.origin[d] = sight.matrix[4 * d + 3];
     }
     plan.near_cm = probe.near, plan.row_cm = (probe.far - probe.near) / height_, plan.most_cm = probe.cull_far;
     plan.start = probe.start, plan.span = probe.span;
@@ -163,76 +212,147 @@ ultragray_plan View::plan(const double* pose) const {
     return plan;
 }
 
-void View::finish(const double* pose, const float* drawn, int threads, void* pixels) const {
-    const Pose place = Pose::read(pose, "pose");
-    Planes planes = wanted_planes();
+Extrapolation View::finish(const double* pose, const float* drawn, int threads, void* pixels) const {
+    const Sight sight = sight_of(Pose::read(pose, "pose"), "pose");
+    Extrapolation found = judged_by_pose(sight);
+    Planes planes = wanted_planes(true);
     for (std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage}) {
         std::copy_n(drawn, plane->size(), plane->data());
         drawn += plane->size();
     }
-    finish(place, kernel_view(place), planes, threads, static_cast<unsigned char*>(pixels));
+    finish(sight, planes, threads, &found, static_cast<unsigned char*>(pixels));
+    return found;
 }
 
 bool View::asks_for(const char* output) const {
     return std::find(settings_.outputs.begin(), settings_.outputs.end(), output) != settings_.outputs.end();
 }
 
-// Room for the planes that the outputs follow from, and for those that tools and ghosts do.
-Planes View::wanted_planes() const {
+Sight View::sight_of(const Pose& pose, const std::string& name) const {
+    const Vector& centre = scene_->scene.info.centre_mm;
+    Sight sight{name, pose, probe_, scene_->at_rest(pose), {}, {}, {}};
+    Vector motion_mm{};
+    if (settings_.contact) {
+        sight.touch.emplace(scene_->skin(), probe_, pose, width_);
+        if (settings_.contact == Contact::Pressure && sight.touch->pressed_mm > 0.0)
+            sight.probe = library::at_rest(probe_, sight.touch->pressed_mm, motion_mm);
+    }
+    // By way of the kernels' own frame, cm about the scene's centre, as Python goes it: so that nothing is rounded
+    // otherwise.
+    Pose inside = sight.at_rest;
+    inside.origin = plus(times(minus(inside.origin, centre), 1.0 / 10.0), inside.turned(times(motion_mm, 1.0 / 10.0)));
+    sight.at_rest.origin = plus(times(inside.origin, 10.0), centre);
+    sight.probe.kernel_pose(inside, sight.matrix);
+    sight.geometry = sight.probe.kernel(height_, beam_);
+    return sight;
+}
+
+// Room for the planes that the outputs follow from, and for those that tools, ghosts and confidence do.
+Planes View::wanted_planes(bool judged) const {
     const size_t size = size_t(height_) * width_;
-    const bool beam = asks_for("transmittance") || asks_for("attenuation");
-    const bool ghosts = settings_.ghost.value_or(0.0) > 0.0 && (beam || asks_for("bmode") || asks_for("echo"));
-    const bool tools = settings_.tools && !settings_.tools->empty() && asks_for("bmode");
+    const bool uncertain = asks_for("uncertainty"), bmode = asks_for("bmode") || uncertain;
+    const bool beam = asks_for("transmittance") || asks_for("attenuation") || uncertain;
+    const bool ghosts = settings_.ghost.value_or(0.0) > 0.0 && (beam || bmode || asks_for("echo"));
+    const bool tools = settings_.tools && !settings_.tools->empty() && bmode;
     Planes planes;
-    if (ghosts || asks_for("bmode")) planes.bmode.resize(size);
+    if (ghosts || bmode) planes.bmode.resize(size);
     if (ghosts || asks_for("echo")) planes.echo.resize(size);
     if (ghosts || tools || beam) planes.transmittance.resize(size);
-    if (asks_for("coverage")) planes.coverage.resize(size);
+    if (asks_for("coverage") || uncertain || judged) planes.coverage.resize(size);
     return planes;
 }
 
-View::KernelView View::kernel_view(const Pose& pose) const {
-    KernelView view;
-    const Pose at_rest = scene_->tissue ? scene_->tissue->at_rest(pose) : pose;
-    probe_.kernel_pose(at_rest, scene_->scene.info.centre_mm, view.pose);
-    view.probe = probe_.kernel(height_, beam_);
-    return view;
-}
-
-// From planes to pixels.
-void View::finish(const Pose& pose, const KernelView& view, Planes& drawn, int threads, unsigned char* pixels) const {
-    const size_t size = size_t(height_) * width_;
-    const ScanView seen(probe_, pose, width_, beam_);
+void View::finish(const Sight& sight, Planes& drawn, int threads, Extrapolation* judged, unsigned char* pixels) const {
+    const ScanView seen(probe_, sight.pose, width_, beam_);
     const ToolsInView tools(settings_.tools.value_or(std::vector<Tool>{}), seen, height_);
     tools.draw(drawn);
+    // No beam gets out along a scan line without contact.
+    const auto leave_heard = [&](std::vector<float>& plane) {
+        for (size_t k = 0; sight.touch && k < plane.size(); ++k)
+            if (!sight.touch->lines[k % width_]) plane[k] = 0.0f;
+    };
+    leave_heard(drawn.bmode), leave_heard(drawn.transmittance);
     const double ghost = settings_.ghost.value_or(0.0);
-    if (ghost > 0.0 && !drawn.echo.empty() && !drawn.bmode.empty()) add_ghosts(drawn, probe_, height_, width_, ghost);
-    std::vector<float> taken(asks_for("attenuation") ? size : 0);  // the share of the beam that ends in a pixel
-    for (size_t k = 0; k < taken.size(); ++k) {
-        const float above = k < size_t(width_) ? 1.0f : drawn.transmittance[k - width_];
-        const float share = 1.0f - drawn.transmittance[k] / std::max(above, kSpentBeam);
-        taken[k] = above >= kSpentBeam ? std::clamp(share, 0.0f, 1.0f) : 0.0f;
+    if (ghost > 0.0 && !drawn.echo.empty() && !drawn.bmode.empty()) add_ghosts(drawn, sight.probe, height_, width_, ghost);
+
+    bool masked = false;
+    if (judged) {
+        const auto supported = std::count_if(drawn.coverage.begin(), drawn.coverage.end(),
+                                             [](float coverage) { return coverage >= kSupportCoverage; });
+        add_support(*judged, scene_->confidence(), float(supported) / float(drawn.coverage.size()));
+        if (sight.touch) judged->contact_share = sight.touch->share;
+        require_confidence(sight, *judged);
+        masked = settings_.below_min_confidence == Below::Mask && !is_confident(*judged, settings_.min_confidence);
     }
     for (const std::string& output : settings_.outputs) {
         std::vector<float> plane = output == "bmode"           ? drawn.bmode
                                    : output == "echo"          ? drawn.echo
                                    : output == "transmittance" ? drawn.transmittance
                                    : output == "coverage"      ? drawn.coverage
-                                   : output == "attenuation"   ? taken
-                                                               : labels(view, threads);
+                                   : output == "attenuation"   ? attenuation(drawn.transmittance)
+                                   : output == "uncertainty"   ? uncertainty(sight, drawn)
+                                                               : labels(sight, threads);
         if (is_numbers(output)) tools.mark(plane);
+        if (output == "bmode" && speckle_) {
+            std::optional<SpeckleSamples> pressed;
+            if (sight.probe.far_mm != probe_.far_mm) pressed.emplace(scene_->speckle->model(), sight.probe, height_, width_);
+            plane = scene_->speckle->added(plane, pressed ? *pressed : *speckle_, sight.at_rest, threads);
+            leave_heard(plane);
+        }
+        plane.resize(size_t(rows_) * width_);
+        if (output == "bmode") set_tone(plane, sight.pose);
+        if (output == "bmode" && display_.edge > 0.0) sharpen(plane);
+        for (size_t k = 0; masked && !tells_support(output) && k < plane.size(); ++k)
+            if (drawn.coverage[k] < kSupportCoverage) plane[k] = 0.0f;
         put(output, plane, pixels);
-        const bool bytes = is_numbers(output) || settings_.encoding == Encoding::Uint8;
-        pixels += size_t(picture_.height) * picture_.width * (bytes ? 1 : sizeof(float));
+        pixels += size_t(picture_.height) * picture_.width * bytes_per_pixel(output);
     }
 }
 
+Extrapolation View::judged_by_pose(const Sight& sight) const {
+    const Extrapolation found = assess(scene_->views.get(), scene_->confidence(), sight.pose, probe_);
+    require_confidence(sight, found);
+    return found;
+}
+
+void View::require_confidence(const Sight& sight, const Extrapolation& found) const {
+    if (settings_.below_min_confidence == Below::Mask || is_confident(found, settings_.min_confidence)) return;
+    char text[320];
+    int length = std::snprintf(text, sizeof text, "%s has a confidence of %.2f, %g is asked for", sight.name.c_str(),
+                               std::isnan(found.confidence) ? 0.0 : found.confidence, *settings_.min_confidence);
+    if (!std::isnan(found.distance_mm))
+        length += std::snprintf(text + length, sizeof text - length,
+                                ": the nearest training views are %.1f mm and %.1f degrees away", found.distance_mm,
+                                found.angle_deg);
+    if (!std::isnan(found.supported_share))
+        std::snprintf(text + length, sizeof text - length, "; Gaussians support %.0f%% of its pixels",
+                      100.0 * found.supported_share);
+    throw Fault(text);
+}
+
+// The share of the beam that ends in a pixel.
+std::vector<float> View::attenuation(const std::vector<float>& transmittance) const {
+    std::vector<float> taken;
+    for (size_t k = 0; k < transmittance.size(); ++k) {
+        const float above = k < size_t(width_) ? 1.0f : transmittance[k - width_];
+        const float share = 1.0f - transmittance[k] / std::max(above, kSpentBeam);
+        taken.push_back(above >= kSpentBeam ? std::clamp(share, 0.0f, 1.0f) : 0.0f);
+    }
+    return taken;
+}
+
+std::vector<float> View::uncertainty(const Sight& sight, const Planes& drawn) const {
+    const ViewMeasures measures = scene_->views_at_rest->measure(sight.at_rest, sight.probe, kUncertaintyPoints);
+    return deviations(*scene_->confidence()->uncertainty, measures, {drawn.bmode, drawn.coverage, drawn.transmittance},
+                      height_, width_);
+}
+
 // The label whose Gaussians weigh most at each pixel; 0 where none weighs 1/255. Of equals the smallest is taken.
-std::vector<float> View::labels(const KernelView& view, int threads) const {
+std::vector<float> View::labels(const Sight& sight, int threads) const {
     const size_t size = size_t(height_) * width_;
     std::vector<float> found(size), heaviest(size), weight(size);
     for (const auto& [label, part] : scene_->scene.parts) {
-        ultragray::render(*part, view.probe, view.pose, 1, height_, width_, threads, "auto",
+        ultragray::render(*part, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
                           {nullptr, nullptr, nullptr, nullptr, weight.data(), nullptr, nullptr, nullptr, 0.0f}, {});
         for (size_t k = 0; k < size; ++k)
             if (weight[k] > heaviest[k] && weight[k] >= kLeastWeightSum) heaviest[k] = weight[k], found[k] = float(label);
@@ -240,11 +360,8 @@ std::vector<float> View::labels(const KernelView& view, int threads) const {
     return found;
 }
 
-// Shows a plane as the display settings want it: those of tone change B-mode alone.
-void View::put(const std::string& output, std::vector<float>& plane, unsigned char* pixels) const {
-    plane.resize(size_t(rows_) * width_);
-    if (output == "bmode" && !lift_.empty()) set_tone(plane);
-    if (output == "bmode" && display_.edge > 0.0) sharpen(plane);
+// Shows a plane [rows, W] as the picture has it, in the encoding.
+void View::put(const std::string& output, const std::vector<float>& plane, unsigned char* pixels) const {
     const int height = picture_.height, width = picture_.width;
     const bool nearest = is_numbers(output);
     for (int row = 0; row < height; ++row) {
@@ -261,20 +378,45 @@ void View::put(const std::string& output, std::vector<float>& plane, unsigned ch
                 value = !s.inside ? 0.0f : nearest ? plane[s.nearest] : upper + (lower - upper) * s.down;
             }
             const size_t to = size_t(row) * width + column;
-            if (nearest)
+            if (nearest) {
                 pixels[to] = static_cast<unsigned char>(value);
-            else if (settings_.encoding == Encoding::Uint8)
+            } else if (settings_.encoding == Encoding::Uint8) {
                 pixels[to] = rounded(value);
-            else
+            } else if (settings_.encoding == Encoding::Float16) {
+                const uint16_t half = halved(value);
+                std::memcpy(pixels + to * sizeof half, &half, sizeof half);
+            } else {
                 std::memcpy(pixels + to * sizeof value, &value, sizeof value);
+            }
         }
     }
 }
 
-// Grey levels of each echo raised by its gain: 0 dB is white, the dynamic range below it black.
-void View::set_tone(std::vector<float>& bmode) const {
-    const float scale = float(kFrameRangeDb / display_.dynamic_range_db);
-    for (size_t k = 0; k < bmode.size(); ++k) bmode[k] = std::clamp(bmode[k] * scale + lift_[k / width_], 0.0f, 1.0f);
+// Grey levels of each echo raised by its gain: 0 dB is white, the dynamic range below it black. Where they are drawn at
+// random the pose decides.
+void View::set_tone(std::vector<float>& bmode, const Pose& pose) const {
+    double gain = display_.gain_db, range = display_.dynamic_range_db;
+    const std::vector<double>&gains = display_.gain_db_between, &ranges = display_.dynamic_range_db_between,
+          &points = display_.tgc_db;
+    if (!gains.empty() || !ranges.empty()) {
+        const auto [first, second] = drawn_shares(uint64_t(display_.display_seed), pose);
+        if (!gains.empty()) gain = gains[0] + first * (gains[1] - gains[0]);
+        if (!ranges.empty()) range = ranges[0] + second * (ranges[1] - ranges[0]);
+    }
+    const bool by_depth = std::any_of(points.begin(), points.end(), [](double one) { return one != 0.0; });
+    if (gain == 0.0 && range == kFrameRangeDb && !by_depth) return;
+    const float scale = float(kFrameRangeDb / range);
+    for (int row = 0; row < rows_; ++row) {
+        double here = gain;
+        if (by_depth) {
+            const double place = (row + 0.5) / rows_ * double(points.size() - 1);
+            const size_t low = std::min(size_t(place), points.size() - 1), high = std::min(low + 1, points.size() - 1);
+            here += points[low] + (place - double(low)) * (points[high] - points[low]);
+        }
+        const float lift = float(1.0 - kFrameRangeDb / range) + float(here) / float(range);
+        for (float* pixel = &bmode[size_t(row) * width_]; pixel != &bmode[size_t(row) * width_] + width_; ++pixel)
+            *pixel = std::clamp(*pixel * scale + lift, 0.0f, 1.0f);
+    }
 }
 
 // Unsharp masking by the mean of 3x3 samples; at the border the outermost ones count twice.

@@ -10,6 +10,7 @@ namespace {
 constexpr double kPi = 3.14159265358979323846;
 constexpr double kRotationTolerance = 1e-3, kExact = 1e-14, kMostPosition = 1e6;
 constexpr int kPolarSteps = 8;  // of Newton's iteration from within the tolerance: three would do
+constexpr int kSquarings = 60;
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 double radians(double degrees) { return degrees * (kPi / 180.0); }
@@ -91,6 +92,48 @@ Vector Pose::at(const Vector& point) const {
     return out;
 }
 
+void quaternion_products(const double r[3][3], double products[4][4]) {
+    const double trace = r[0][0] + r[1][1] + r[2][2];
+    const double odd[3] = {r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]};
+    products[0][0] = 1.0 + trace;
+    for (int i = 0; i < 3; ++i) {
+        products[0][i + 1] = products[i + 1][0] = odd[i];
+        for (int j = 0; j < 3; ++j) products[i + 1][j + 1] = r[i][j] + r[j][i] + (i == j ? 1.0 - trace : 0.0);
+    }
+}
+
+// Of all rotations, the nearest to a mean of some is that of the quaternion q which has the largest qᵀ K q, K being the
+// mean of their products: by squaring K until nothing but that eigenvector's product is left.
+void mean_axes(const std::vector<Pose>& poses, double axes[3][3]) {
+    double mean[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, k[4][4], square[4][4];
+    for (int i = 0; i < 3 && !poses.empty(); ++i)
+        for (int j = 0; j < 3; ++j) {
+            mean[i][j] = 0;
+            for (const Pose& pose : poses) mean[i][j] += pose.turn[i][j];
+            mean[i][j] /= double(poses.size());
+        }
+    quaternion_products(mean, k);
+    for (int step = 0; step < kSquarings; ++step) {
+        const double trace = k[0][0] + k[1][1] + k[2][2] + k[3][3];
+        for (auto& row : k)
+            for (double& one : row) one /= trace;
+        for (int i = 0; i < 4; ++i)
+            for (int j = 0; j < 4; ++j)
+                square[i][j] = k[i][0] * k[0][j] + k[i][1] * k[1][j] + k[i][2] * k[2][j] + k[i][3] * k[3][j];
+        std::copy(&square[0][0], &square[0][0] + 16, &k[0][0]);
+    }
+    int largest = 0;
+    for (int i = 1; i < 4; ++i)
+        if (k[i][i] > k[largest][largest]) largest = i;
+    const double* q = k[largest];
+    const double norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], w = q[0], x = q[1], y = q[2], z = q[3];
+    const double rotation[3][3] = {{w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)},
+                                   {2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)},
+                                   {2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z}};
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) axes[i][j] = rotation[i][j] / norm2;
+}
+
 namespace {
 
 // A case for each kind: one without does not compile.
@@ -123,17 +166,16 @@ Probing Probing::ending_at(double far) const {
 
 double Probing::breadth_mm(double depth) const { return is_angular() ? depth * radians(span) : span; }
 
-void Probing::ray(double across, double origin[2], double direction[2]) const {
+void Probing::ray(double across, Vector& origin, Vector& direction) const {
     const double angle = radians(is_angular() ? across : steering_deg);
-    origin[0] = is_angular() ? 0.0 : across, origin[1] = 0.0;
-    direction[0] = std::sin(angle), direction[1] = std::cos(angle);
+    origin = {is_angular() ? 0.0 : across, 0.0, 0.0};
+    direction = {std::sin(angle), 0.0, std::cos(angle)};
 }
 
 Vector Probing::point(double row, double column) const {
-    double origin[2], direction[2];
+    Vector origin, direction;
     ray(start() + span * column, origin, direction);
-    const double depth = near_mm + length_mm() * row;
-    return {origin[0] + depth * direction[0], 0.0, origin[1] + depth * direction[1]};
+    return plus(origin, times(direction, near_mm + length_mm() * row));
 }
 
 std::vector<Vector> Probing::corners() const {
@@ -156,7 +198,7 @@ Place Probing::place(double x, double z) const {
     return {std::hypot(x, z), angle < 0 ? angle + span : angle};
 }
 
-void Probing::kernel_pose(const Pose& pose, const Vector& centre, double matrix[16]) const {
+void Probing::kernel_pose(const Pose& pose_cm, double matrix[16]) const {
     double axis[3] = {0.0, 0.0, 1.0};  // of depth, in the axes of the pose
     if (lines == Lines::Parallel) {
         const double along_x = std::sin(radians(steering_deg)), along_z = std::cos(radians(steering_deg));
@@ -164,11 +206,11 @@ void Probing::kernel_pose(const Pose& pose, const Vector& centre, double matrix[
     }
     std::fill(matrix, matrix + 16, 0.0);
     for (int i = 0; i < 3; ++i) {
-        const double* row = pose.turn[i];
+        const double* row = pose_cm.turn[i];
         matrix[4 * i] = row[0] + row[2] * axis[0];
         matrix[4 * i + 1] = row[1];
         matrix[4 * i + 2] = row[2] * axis[2];
-        matrix[4 * i + 3] = (pose.origin[i] - centre[i]) / 10.0;
+        matrix[4 * i + 3] = pose_cm.origin[i];
     }
     matrix[15] = 1.0;
 }

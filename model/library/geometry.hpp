@@ -2,6 +2,7 @@
 #pragma once
 
 #include <array>
+#include <cmath>
 #include <vector>
 
 #include "../kernels/render.hpp"
@@ -10,6 +11,15 @@
 namespace ultragray::library {
 
 using Vector = std::array<double, 3>;
+
+inline double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+inline Vector minus(const Vector& a, const Vector& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
+inline Vector plus(const Vector& a, const Vector& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
+inline Vector times(const Vector& a, double s) { return {a[0] * s, a[1] * s, a[2] * s}; }
+inline Vector cross(const Vector& a, const Vector& b) {
+    return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+}
+inline double length(const Vector& a) { return std::sqrt(dot(a, a)); }
 
 // A rigid transform from the probe to the scene, and the point that a point goes to.
 struct Pose {
@@ -22,7 +32,13 @@ struct Pose {
     Vector turned(const Vector& v) const;
     Vector turned_back(const Vector& v) const;
     Vector at(const Vector& point) const;
+    Vector axis(int which) const { return {turn[0][which], turn[1][which], turn[2][which]}; }  // lateral, elevation, axial
 };
+
+// 4 q qᵀ of the unit quaternion q of a rotation.
+void quaternion_products(const double rotation[3][3], double products[4][4]);
+// The lateral, elevation and axial directions (columns) of the rotation nearest to the mean of the poses' rotations.
+void mean_axes(const std::vector<Pose>& poses, double axes[3][3]);
 
 // A point of the image plane by its scan line: the depth along it, and its place `across`, mm or degrees.
 struct Place {
@@ -44,13 +60,14 @@ struct Probing {
     double length_mm() const { return far_mm - near_mm; }
     double depth_mm(int row, int height) const { return near_mm + length_mm() * (row + 0.5) / height; }
     double breadth_mm(double depth) const;  // of a row of the image
-    // Origin and unit direction of the line at a place: x and z of each.
-    void ray(double across, double origin[2], double direction[2]) const;
+    double across(double column, int width) const { return start() + span * ((column + 0.5) / width); }
+    // The point of depth 0 of the line at a place, and its unit direction, in the probe's frame.
+    void ray(double across, Vector& origin, Vector& direction) const;
     Vector point(double row, double column) const;  // of image coordinates from 0 to 1, in the probe's frame
     std::vector<Vector> corners() const;
     Place place(double x, double z) const;
-    // The pose's axes as the kernels take them, in cm: parallel lines run along z in a sheared plane.
-    void kernel_pose(const Pose& pose, const Vector& centre, double matrix[16]) const;
+    // The axes of a pose in cm as the kernels take them: parallel lines run along z in a sheared plane.
+    void kernel_pose(const Pose& pose_cm, double matrix[16]) const;
     ProbeGeometry kernel(int height, const std::optional<ElevationBeam>& beam) const;
 };
 

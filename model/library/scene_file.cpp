@@ -142,6 +142,8 @@ SceneInfo info_of(const std::string& text) {
     if (given("gaussian_count")) info.gaussian_count = whole.at("gaussian_count").integer({0.0, 1e9, {}});
     if (given("beam")) info.beam = ElevationBeam::read(whole.at("beam"));
     if (given("speckle")) info.speckle = SpeckleModel::read(whole.at("speckle"));
+    if (given("confidence") && !document["confidence"].empty())
+        info.confidence = ConfidenceModel::read(whole.at("confidence"));
     if (given("tissue_shares")) info.tissue_shares = whole.at("tissue_shares").vector<3>({0.0, 1.0, {}});
     if (given("label_names")) {
         const Value names = whole.at("label_names");
@@ -221,6 +223,10 @@ Scene Scene::read(const void* bytes, size_t size) {
             throw Fault("there must be one of each pose beside the training poses");
     if (info.tissue_shares.has_value() == scene.rest_poses.empty() || (info.tissue_shares && !info.probe))
         throw Fault("tissue_shares, rest_poses (one or more) and a probe belong together");
+    const size_t views = scene.training_poses.size();
+    if (info.confidence && info.probe && views && info.confidence->hardness.size() != views)
+        throw Fault("confidence.hardness must have one number for each of " + std::to_string(views) +
+                    " training poses, got " + std::to_string(info.confidence->hardness.size()));
     return scene;
 }
 

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "../kernels/scene.hpp"
-#include "geometry.hpp"
+#include "confidence.hpp"
 
 namespace ultragray::library {
 
@@ -20,6 +20,7 @@ struct SceneInfo {
     std::vector<std::pair<int, std::string>> label_names;
     std::optional<ElevationBeam> beam;
     std::optional<SpeckleModel> speckle;
+    std::optional<ConfidenceModel> confidence;
     std::optional<Vector> tissue_shares;
     std::string json;  // all of it, as the file has it
 };

@@ -18,14 +18,8 @@ void product(const Rotation a, const Rotation b, Rotation out) {
 
 // Axis times angle, at most pi, of a rotation: by the largest component of its quaternion.
 Vector turn_of(const Rotation r) {
-    const double trace = r[0][0] + r[1][1] + r[2][2];
-    const double odd[3] = {r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]};
     double products[4][4];
-    products[0][0] = 1.0 + trace;
-    for (int i = 0; i < 3; ++i) {
-        products[0][i + 1] = products[i + 1][0] = odd[i];
-        for (int j = 0; j < 3; ++j) products[i + 1][j + 1] = r[i][j] + r[j][i] + (i == j ? 1.0 - trace : 0.0);
-    }
+    quaternion_products(r, products);
     int largest = 0;
     for (int k = 1; k < 4; ++k)
         if (products[k][k] > products[largest][largest]) largest = k;

@@ -15,15 +15,6 @@ constexpr float kLeastSeen = 1.0f / 255.0f, kLabelled = 0.25f, kLeastBeam = 1e-6
 constexpr float kByPulse = float(0.5 / (0.15 * 0.15));  // of the squared distance from a surface, 1/mm2
 constexpr float kHeadOnSigmaDeg = 20.0f;
 
-double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-Vector minus(const Vector& a, const Vector& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
-Vector plus(const Vector& a, const Vector& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
-Vector times(const Vector& a, double s) { return {a[0] * s, a[1] * s, a[2] * s}; }
-Vector cross(const Vector& a, const Vector& b) {
-    return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-double length(const Vector& a) { return std::sqrt(dot(a, a)); }
-
 template <class Shape>
 double thickness_of(const Shape& tool) {
     if constexpr (std::is_same_v<Shape, Box>)
@@ -214,17 +205,16 @@ ScanView::ScanView(const Probing& probe, const Pose& pose, int width, const std:
     sigma_mm_ = (thick ? beam->thickness_mm : kBeamMm) / kFwhmPerSigma;
     focus_mm_ = thick ? beam->focus_mm.value_or(0.0) + probe.face_mm : 0.0;
     rayleigh_mm_ = thick && beam->depth_of_field_mm ? *beam->depth_of_field_mm / 2.0 : kInfinity;
-    double origin[2], direction[2], ends[2][2][2];
+    Vector origin, direction, ends[2][2];
     for (int j = 0; j < width; ++j) {
-        probe.ray(probe.start() + probe.span * ((j + 0.5) / width), origin, direction);
-        lines.push_back(
-            {{origin[0], 0.0, origin[1]}, {direction[0], 0.0, direction[1]}, {direction[1], 0.0, -direction[0]}});
+        probe.ray(probe.across(j, width), origin, direction);
+        lines.push_back({origin, direction, {direction[2], 0.0, -direction[0]}});
     }
     for (int side = 0; side < 2; ++side)
         probe.ray(probe.start() + probe.span * (0.5 + (side - 0.5) / width), ends[side][0], ends[side][1]);
-    const double* along = ends[0][1];
-    turn = std::acos(std::clamp(along[0] * ends[1][1][0] + along[1] * ends[1][1][1], -1.0, 1.0));
-    apart_mm_ = std::fabs((ends[1][0][0] - ends[0][0][0]) * along[1] - (ends[1][0][1] - ends[0][0][1]) * along[0]);
+    turn = std::acos(std::clamp(dot(ends[0][1], ends[1][1]), -1.0, 1.0));
+    const Vector beside = minus(ends[1][0], ends[0][0]), along = ends[0][1];
+    apart_mm_ = std::fabs(beside[0] * along[2] - beside[2] * along[0]);
 }
 
 double ScanView::spacing_mm(double depth) const { return std::max(apart_mm_ + turn * depth, kLeastSpacingMm); }

@@ -39,9 +39,7 @@ Result guarded(Result failed, const Act& act) {
 ultragray_scene* ultragray_load(const void* bytes, size_t size) {
     return guarded<ultragray_scene*>(nullptr, [&] {
         if (bytes == nullptr) throw Fault("there are no bytes of a scene file");
-        auto loaded = std::make_shared<LoadedScene>(LoadedScene{Scene::read(bytes, size), nullptr});
-        if (loaded->scene.info.tissue_shares) loaded->tissue = std::make_unique<FollowingTissue>(loaded->scene);
-        return new ultragray_scene{std::move(loaded)};
+        return new ultragray_scene{std::make_shared<LoadedScene>(Scene::read(bytes, size))};
     });
 }
 
@@ -62,10 +60,11 @@ size_t ultragray_frame_bytes(const ultragray_view* view) { return view->view.fra
 
 void ultragray_free_view(ultragray_view* view) { delete view; }
 
-int ultragray_render(const ultragray_view* view, const double* poses, size_t count, int threads, void* pixels) {
+int ultragray_render(const ultragray_view* view, const double* poses, size_t count, int threads, void* pixels,
+                     ultragray_extrapolation* extrapolations) {
     return guarded(1, [&] {
         if (view == nullptr || poses == nullptr || pixels == nullptr) throw Fault("view, poses and pixels must be given");
-        view->view.render(poses, count, threads < 1 ? 1 : threads, pixels);
+        view->view.render(poses, count, threads < 1 ? 1 : threads, pixels, extrapolations);
         return 0;
     });
 }
@@ -85,11 +84,13 @@ int ultragray_plan_of(const ultragray_view* view, const double* pose, ultragray_
     });
 }
 
-int ultragray_finish(const ultragray_view* view, const double* pose, const float* planes, int threads, void* pixels) {
+int ultragray_finish(const ultragray_view* view, const double* pose, const float* planes, int threads, void* pixels,
+                     ultragray_extrapolation* extrapolation) {
     return guarded(1, [&] {
         if (view == nullptr || pose == nullptr || planes == nullptr || pixels == nullptr)
             throw Fault("view, pose, planes and pixels must be given");
-        view->view.finish(pose, planes, threads < 1 ? 1 : threads, pixels);
+        const Extrapolation found = view->view.finish(pose, planes, threads < 1 ? 1 : threads, pixels);
+        if (extrapolation) *extrapolation = found;
         return 0;
     });
 }

@@ -2,7 +2,7 @@
  *
  *     ultragray_scene *scene = ultragray_load(bytes, size);
  *     ultragray_view *view = ultragray_prepare(scene, "{\"height\": 384, \"width\": 384}");
- *     ultragray_render(view, pose, 1, threads, pixels);      as often as poses come
+ *     ultragray_render(view, pose, 1, threads, pixels, NULL);    as often as poses come
  *
  * A pose is a matrix [4, 4] of doubles, row by row: the rigid transform from the probe to the scene, in mm, of right-handed
  * axes. Settings are those of RenderSettings of the HTTP interface, as JSON; what a service alone can do is refused.
@@ -38,13 +38,23 @@ ULTRAGRAY_API void ultragray_free_scene(ultragray_scene *scene);
 ULTRAGRAY_API ultragray_view *ultragray_prepare(const ultragray_scene *scene, const char *settings);
 /* Outputs, encoding, and height, width and place of the picture: JSON, as long as the view is there. */
 ULTRAGRAY_API const char *ultragray_view_info(const ultragray_view *view);
-/* The bytes of one pose's frame: its outputs one after another, each [height, width] of uint8 or float32; labels uint8. */
+/* The bytes of one pose's frame: its outputs one after another, each [height, width] in the encoding; labels uint8. */
 ULTRAGRAY_API size_t ultragray_frame_bytes(const ultragray_view *view);
 ULTRAGRAY_API void ultragray_free_view(ultragray_view *view);
 
-/* Frames of `count` poses [count, 4, 4] into `pixels`, count * ultragray_frame_bytes(view), on up to so many threads.
- * Returns 0, or another number where it failed. */
-ULTRAGRAY_API int ultragray_render(const ultragray_view *view, const double *poses, size_t count, int threads, void *pixels);
+/* How far a frame extrapolates from what its scene was trained on; NaN is not known. */
+typedef struct ultragray_extrapolation {
+    double distance_mm;     /* to the nearest training views, a mean over the image */
+    double angle_deg;       /* to them */
+    double confidence;      /* the MS-SSIM that a real frame at this pose is expected to have with this one, 0 to 1 */
+    double supported_share; /* of the pixels: those that Gaussians support */
+    double contact_share;   /* of the scan lines: those with contact; NaN where contact is assumed */
+} ultragray_extrapolation;
+
+/* Frames of `count` poses [count, 4, 4] into `pixels`, count * ultragray_frame_bytes(view), on up to so many threads; and how
+ * far each extrapolates into `extrapolations` [count], which may be NULL. Returns 0, or another number where it failed. */
+ULTRAGRAY_API int ultragray_render(const ultragray_view *view, const double *poses, size_t count, int threads, void *pixels,
+                                   ultragray_extrapolation *extrapolations);
 
 /* For renderers that draw planes themselves, such as a GPU's: what ultragray_render draws by, and the rest of a frame. */
 
@@ -71,7 +81,7 @@ typedef struct ultragray_plan {
 ULTRAGRAY_API int ultragray_plan_of(const ultragray_view *view, const double *pose, ultragray_plan *plan);
 /* As ultragray_render, of one pose and the planes [height, width] that its plan wants, one after another. */
 ULTRAGRAY_API int ultragray_finish(const ultragray_view *view, const double *pose, const float *planes, int threads,
-                                   void *pixels);
+                                   void *pixels, ultragray_extrapolation *extrapolation);
 
 /* What was wrong with the last call of this thread that failed: a sentence, until its next call. */
 ULTRAGRAY_API const char *ultragray_problem(void);

@@ -181,18 +181,30 @@ test("a scene of a service is rendered behind the same interface", async () => {
       const { Scene } = await import("/package/index.js");
       const [local, served] = await Promise.all([Scene.load("/package/scene.ugr"), Scene.connect(location.origin, "demo")]);
       const { poses } = await (await fetch("/package/page.json")).json();
-      const settings = { height: 64, width: 80, display: { gain_db: 5 } };
-      let most = 0;
+      const drawn = { gain_db_between: [-5, 5], dynamic_range_db_between: [45, 70] };
+      const settings = { height: 64, width: 80, display: drawn, contact: "pressure", speckle: "natural" };
+      let [most, extrapolations] = [0, []];
       for (const pose of poses.slice(0, 5)) {
         const frames = await Promise.all([local, served].map((scene) => scene.render(pose, settings)));
         const [one, other] = frames.map((frame) => frame.pixels());
         one.forEach((value, at) => (most = Math.max(most, Math.abs(value - other[at]))));
+        extrapolations.push(frames.map((frame) => frame.extrapolation));
       }
       const refused = await served.render(poses[0], { height: 0 }).catch((error) => error.message);
       const again = await served.render(poses[0], settings);
-      return { most, refused, width: again.info.width, same: local.info.image_height === served.info.image_height };
+      const halves = await Promise.all([local, served].map((scene) => scene.render(poses[0], { height: 9, encoding: "float16" })));
+      const doubts = await Promise.all(
+        [local, served].map((scene) => scene.render(poses[0], { min_confidence: 1 }).catch((error) => error.message)),
+      );
+      const pixels = halves.map((frame) => [...frame.pixels()]);
+      return { most, extrapolations, pixels, doubts, refused, width: again.info.width, same: local.info.image_height === served.info.image_height };
     });
     assert.ok(apart.most <= 1, `grey values are ${apart.most} apart`);
+    for (const [local, served] of apart.extrapolations)
+      for (const [name, value] of Object.entries(served)) assert.ok(Math.abs(local[name] - value) < 1e-4, `${name}: ${local[name]}, ${value}`);
+    assert.ok(Math.max(...apart.pixels[0].map((value, at) => Math.abs(value - apart.pixels[1][at]))) < 1e-3);
+    assert.ok(apart.pixels[0].some((value) => value > 0.1 && value <= 1));
+    for (const doubt of apart.doubts) assert.match(doubt, /has a confidence of 0\.\d\d, 1 is asked for: the nearest/);
     assert.match(apart.refused, /height must be/);
     assert.equal(apart.width, 80);
     assert.ok(apart.same);

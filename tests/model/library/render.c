@@ -26,12 +26,14 @@ int main(int count, char **words) {
     free(data);
     const size_t frames = pose_bytes / 128, bytes = view ? frames * ultragray_frame_bytes(view) : 0;
     unsigned char *pixels = malloc(bytes + 1);
-    const int failed = !view || ultragray_render(view, (const double *)poses, frames, 2, pixels) != 0;
+    ultragray_extrapolation *figures = calloc(frames + 1, sizeof *figures);
+    const int failed = !view || ultragray_render(view, (const double *)poses, frames, 2, pixels, figures) != 0;
     if (failed) fprintf(stderr, "%s\n", ultragray_problem());
     FILE *out = failed ? NULL : fopen(words[4], "wb");
     if (out) fwrite(pixels, 1, bytes, out), fclose(out);
     ultragray_free_view(view);
     free(poses);
     free(pixels);
+    free(figures);
     return failed;
 }

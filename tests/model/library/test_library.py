@@ -3,18 +3,22 @@
 import ctypes
 import json
 import os
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 
 from ultragray import GaussianScene
 from ultragray.contract import from_dict
+from ultragray.errors import LowConfidence
+from ultragray.exchange.rendering import render_portions
 from ultragray.installation import c_library
 from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.pixels import in_type
 from ultragray.rendering.settings import RenderSettings
+from ultragray.scene.confidence import Assessor, require_confidence
 
 IDENTITY = np.eye(4)
 EXACT = [
@@ -29,6 +33,19 @@ EXACT = [
     },
     {"display": {"gain_db": 6, "dynamic_range_db": 45, "tgc_db": [0, 3, -2], "depth_mm": 30, "flip": True}},
     {"display": {"gain_db": 6, "edge": 1.5}, "encoding": "float32"},
+    {"outputs": ["bmode", "labels", "echo"], "encoding": "float16"},
+    {"speckle": "natural", "encoding": "float32"},
+    {"speckle": "natural", "probe": "C5-2", "height": 200, "width": 90, "display": {"depth_mm": 120}},
+    {"contact": "air", "outputs": ["bmode", "transmittance", "echo", "attenuation"]},
+    {"contact": "pressure", "encoding": "float32", "outputs": ["bmode", "labels"]},
+    {"contact": "pressure", "speckle": "natural", "ghost": 0.5, "height": 160, "width": 120},
+    {"outputs": ["uncertainty", "bmode"], "height": 100, "width": 77},
+    {
+        "display": {"gain_db_between": [-6, 6], "dynamic_range_db_between": [40, 70], "display_seed": 5},
+        "encoding": "float32",
+    },
+    {"display": {"gain_db_between": [-20, 0], "tgc_db": [0, 4]}},
+    {"min_confidence": 0.99, "below_min_confidence": "mask", "outputs": ["bmode", "labels", "coverage", "uncertainty"]},
 ]
 NEEDLE = {"kind": "needle", "tip_mm": [5.0, 0.2, 30.0], "hub_mm": [-25.0, -0.3, 2.0], "frame": "probe"}
 ACROSS = {"kind": "needle", "tip_mm": [0.0, 8.0, 20.0], "hub_mm": [1.0, -8.0, 21.0], "frame": "probe", "label": 7}
@@ -96,11 +113,11 @@ def library():
         ("view_info", text, (pointer,)),
         ("frame_bytes", size, (pointer,)),
         ("free_view", None, (pointer,)),
-        ("render", ctypes.c_int, (pointer, pointer, size, ctypes.c_int, pointer)),
+        ("render", ctypes.c_int, (pointer, pointer, size, ctypes.c_int, pointer, pointer)),
         ("gaussians", ctypes.POINTER(ctypes.c_float), (pointer,)),
         ("harmonics", ctypes.POINTER(ctypes.c_float), (pointer,)),
         ("plan_of", ctypes.c_int, (pointer, pointer, ctypes.POINTER(Plan))),
-        ("finish", ctypes.c_int, (pointer, pointer, pointer, ctypes.c_int, pointer)),
+        ("finish", ctypes.c_int, (pointer, pointer, pointer, ctypes.c_int, pointer, pointer)),
         ("problem", text, ()),
     ):
         function = getattr(loaded, f"ultragray_{name}")
@@ -121,16 +138,19 @@ class Scene:
         return self.library.ultragray_problem().decode()
 
     def render(self, settings, poses):
-        """What it tells of the frames, and their bytes [C, bytes]."""
+        """What it tells of the frames, their bytes [C, bytes], and how far they extrapolate [C, 5]."""
         view = self.library.ultragray_prepare(self.pointer, json.dumps(settings).encode())
         assert view, self.problem
         pixels = np.empty((len(poses), self.library.ultragray_frame_bytes(view)), np.uint8)
         matrices = np.ascontiguousarray(poses, np.float64)
-        code = self.library.ultragray_render(view, matrices.ctypes.data, len(poses), 2, pixels.ctypes.data)
+        figures = np.empty((len(poses), 5))
+        where = matrices.ctypes.data, len(poses), 2, pixels.ctypes.data, figures.ctypes.data
+        code = self.library.ultragray_render(view, *where)
         info = json.loads(self.library.ultragray_view_info(view))
         self.library.ultragray_free_view(view)
-        assert code == 0, self.problem
-        return info, pixels
+        if code != 0:
+            raise ValueError(self.problem)
+        return info, pixels, figures
 
 
 @pytest.fixture(scope="module")
@@ -170,18 +190,34 @@ def poses_beside(scene, count):
     return poses
 
 
-def both(scene, python_scene, settings, poses):
-    """Each output [C, H, W] of the library and of Python."""
+def of_python(python_scene, settings, poses):
+    """Each output [C, H, W] of Python, and how far the frames extrapolate; frames of pressed tissue are one by one."""
     asked = from_dict(RenderSettings, settings)
     resolved = asked.resolved(python_scene.info, asked.encoding)
-    shown = render_shown(python_scene, resolved, poses)
-    info, pixels = scene.render(settings, poses)
-    assert (info["height"], info["width"]) == (resolved.picture.height, resolved.picture.width)
-    assert info["picture"]["first"] == pytest.approx(resolved.picture.first)
-    assert info["picture"]["step"] == pytest.approx(resolved.picture.step)
+    assessor = Assessor(python_scene.info, python_scene.training_poses)
+    frames, figures = [], []
+    for pose in poses:
+        support = SupportWatch(assessor, assessor.assess(pose, resolved.probe), resolved)
+        frames.append(render_shown(python_scene, resolved, pose[None], support=support))
+        figures += support.completed(0, 1)
+    arrays = {name: np.concatenate([frame[name].numpy() for frame in frames]) for name in resolved.outputs}
+    pixel_type = asked.encoding.pixel_type
+    return {name: in_type(one, np.uint8 if name == "labels" else pixel_type) for name, one in arrays.items()}, figures
+
+
+def both(scene, python_scene, settings, poses):
+    """Each output [C, H, W] of the library and of Python, which tell of the same picture and the same extrapolation."""
+    asked = from_dict(RenderSettings, settings)
+    picture = asked.resolved(python_scene.info, asked.encoding).picture
+    shown, extrapolations = of_python(python_scene, settings, poses)
+    info, pixels, figures = scene.render(settings, poses)
+    assert (info["height"], info["width"]) == (picture.height, picture.width)
+    assert info["picture"]["first"] == pytest.approx(picture.first)
+    assert info["picture"]["step"] == pytest.approx(picture.step)
+    told = [[np.nan if one is None else one for one in astuple(frame)] for frame in extrapolations]
+    np.testing.assert_allclose(figures, told, rtol=1e-6, atol=5e-6)  # the angle's cosine is near 1
     at = 0
-    for name in resolved.outputs:
-        expected = in_type(shown[name].numpy(), np.uint8 if name == "labels" else asked.encoding.pixel_type)
+    for expected in shown.values():
         part = pixels[:, at : at + expected[0].nbytes]
         at += expected[0].nbytes
         yield part.copy().view(expected.dtype).reshape(expected.shape), expected
@@ -195,7 +231,9 @@ def test_frames_are_those_of_python_byte_for_byte(scene, python_scene, settings)
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("settings", [*EXACT, *PUT_IN], ids=json.dumps)
+@pytest.mark.parametrize(
+    "settings", [one for one in (*EXACT, *PUT_IN) if one.get("contact") != "pressure"], ids=json.dumps
+)
 def test_planes_drawn_by_a_plan_become_the_frame(scene, python_scene, settings):
     """The planes are those of the view without tools, ghosts and display settings."""
     library = scene.library
@@ -206,14 +244,15 @@ def test_planes_drawn_by_a_plan_become_the_frame(scene, python_scene, settings):
     wanted = [name for name in PLANES if getattr(plan, name)]
     plain = {name: settings[name] for name in ("probe", "slice_thickness_mm") if name in settings}
     size = {"height": int(plan.height), "width": int(plan.width)}
-    _, planes = scene.render(plain | size | {"outputs": wanted or ["bmode"], "encoding": "float32"}, pose[None])
-    _, expected = scene.render(settings, pose[None])
-    found = np.zeros_like(expected)
-    code = library.ultragray_finish(view, pose.ctypes.data, planes.ctypes.data, 1, found.ctypes.data)
+    _, planes, _ = scene.render(plain | size | {"outputs": wanted, "encoding": "float32"}, pose[None])
+    _, expected, extrapolation = scene.render(settings, pose[None])
+    found, told = np.zeros_like(expected), np.zeros_like(extrapolation)
+    where = pose.ctypes.data, planes.ctypes.data, 1, found.ctypes.data, told.ctypes.data
+    code = library.ultragray_finish(view, *where)
     library.ultragray_free_view(view)
     assert code == 0, scene.problem
-    assert wanted or settings["outputs"] == ["labels"]
     np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(told, extrapolation)
 
 
 def test_the_geometry_of_a_plan_is_the_pose_and_the_probe(scene, python_scene):
@@ -293,9 +332,44 @@ def test_a_view_outlives_its_scene(library, python_scene):
     library.ultragray_free_scene(pointer)
     pose = np.ascontiguousarray(python_scene.training_poses[0])
     pixels = np.zeros(library.ultragray_frame_bytes(view), np.uint8)
-    assert library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data) == 0
+    assert library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data, None) == 0
     assert pixels.any()
     library.ultragray_free_view(view)
+
+
+def test_what_a_scene_does_not_know_is_refused_in_a_sentence(library, python_scene):
+    info = replace(python_scene.info, confidence={}, speckle=None, probe=None)
+    bare = Scene(library, replace(python_scene, info=info).to_bytes())
+    for asked, problem in (
+        ({"min_confidence": 0.5}, "min_confidence needs a scene that knows the confidence of its frames"),
+        ({"outputs": ["uncertainty"]}, "outputs may name uncertainty only for a scene whose training fitted"),
+        ({"speckle": "natural"}, "speckle natural needs a scene whose training fitted the speckle of its frames"),
+        ({"contact": "air"}, "contact needs a scene that knows its training poses and their probe"),
+    ):
+        settings = json.dumps(asked | {"probe": "L7-4"}).encode()
+        assert library.ultragray_prepare(bare.pointer, settings) is None
+        assert problem in bare.problem
+
+
+def render_as_the_service(python_scene, resolved, pose):
+    assessed = Assessor(python_scene.info, python_scene.training_poses).assess(pose, resolved.probe)
+    require_confidence(assessed, resolved.least_confidence)
+    return list(render_portions(python_scene, resolved, pose[None], assessed))
+
+
+def test_frames_below_the_least_confidence_are_refused_as_python_refuses_them(scene, python_scene):
+    beside = python_scene.training_poses[100].copy()
+    assert scene.render({"min_confidence": 0.9}, beside[None])[2][0, 2] > 0.9
+    beside[0, 3] += 15.0
+    for least in (0.9, 0.8):  # more than the pose alone promises, and than its frame turns out to have
+        settings = {"min_confidence": least, "height": 60, "width": 60}
+        asked = from_dict(RenderSettings, settings)
+        resolved = asked.resolved(python_scene.info, asked.encoding)
+        with pytest.raises(LowConfidence) as refusal:
+            render_as_the_service(python_scene, resolved, beside)
+        with pytest.raises(ValueError, match="has a confidence of") as told:
+            scene.render(settings, beside[None])
+        assert str(told.value) == str(refusal.value)
 
 
 @pytest.mark.parametrize(
@@ -312,8 +386,8 @@ def test_a_view_outlives_its_scene(library, python_scene):
         ('{"display": {"gain_db": 300}}', "display.gain_db must be a finite number from -100 to 100, got 300"),
         ('{"display": {"pixel_mm": 0.002}}', "at most 4096 pixels on a side"),
         ('{"outputs": ["sound"]}', "outputs must be some of bmode, "),
-        ('{"contact": "air"}', "contact can be shown by a service alone"),
-        ('{"min_confidence": 0.5}', "min_confidence can be judged by a service alone"),
+        ('{"encoding": "png"}', "encoding must be uint8, float32 or float16 for local frames"),
+        ('{"registration": "table"}', "registration is kept by a service"),
     ],
 )
 def test_wrong_settings_are_one_sentence(scene, settings, problem):
@@ -335,7 +409,7 @@ def test_wrong_poses_are_one_sentence(scene, change, problem):
     view = scene.library.ultragray_prepare(scene.pointer, b'{"height": 8, "width": 8}')
     pose = np.ascontiguousarray(change(IDENTITY))
     pixels = np.zeros(64, np.uint8)
-    assert scene.library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data) != 0
+    assert scene.library.ultragray_render(view, pose.ctypes.data, 1, 1, pixels.ctypes.data, None) != 0
     assert scene.problem.startswith("poses[0] must")
     assert problem in scene.problem
     scene.library.ultragray_free_view(view)

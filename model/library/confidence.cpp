@@ -1,0 +1,257 @@
+#include "confidence.hpp"
+
+#include <algorithm>
+#include <limits>
+
+#include "../kernels/kernel.hpp"
+
+namespace ultragray::library {
+namespace {
+
+constexpr double kPi = 3.14159265358979323846, kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr int kPointsPerSide = 6;
+constexpr float kMmByDegree = 0.02f;
+constexpr double kFarMm = 20.0, kSmallestMm = 1e-6, kNeighbourhoodMm = 3.0, kReach = 1.3, kLeastSum = 1e-9;
+constexpr double kNearMm = 0.3, kDistanceMm = 5.0, kAngleDeg = 10.0;
+
+double logistic(double value) { return 1.0 / (1.0 + std::exp(-std::clamp(value, -500.0, 500.0))); }
+
+double mean_of(const std::vector<double>& values) {
+    double sum = 0;
+    for (const double one : values) sum += one;
+    return sum / double(values.size());
+}
+
+ViewImages images_of(const Probing& probe, const float* axes, const float* offsets, int64_t count) {
+    const float near = float(probe.near_mm), far = float(probe.far_mm);
+    if (probe.wraps()) return {axes, offsets, count, true, 0.0f, 0.0f, 0.0f, 0.0f, 1.0f, near, far};  // there are no edges
+    const double angle = (probe.is_angular() ? probe.span / 2 : probe.steering_deg) * (kPi / 180.0);
+    const double x = std::sin(angle), z = std::cos(angle);
+    if (probe.is_angular()) return {axes, offsets, count, true, 0.0f, float(z), float(x), 0.0f, 1.0f, near, far};
+    return {axes, offsets, count, false, float(x / z), float(z), 0.0f, float(probe.span / 2 * z), float(1.0 / z), near, far};
+}
+
+}  // namespace
+
+TrainingViews::TrainingViews(const std::vector<Pose>& poses, const Probing& probe)
+    : probe_(probe), count_(poses.size()), filled_(poses) {
+    while (filled_.size() % kMaxLanes) filled_.push_back(poses.back());
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int d = 0; d < 3; ++d)
+            for (const Pose& pose : filled_) axes_.push_back(float(pose.turn[d][axis]));
+        for (const Pose& pose : filled_) offsets_.push_back(float(dot(pose.axis(axis), pose.origin)));
+    }
+}
+
+ViewMeasures TrainingViews::measure(const Pose& pose, const Probing& probe, int points_per_side) const {
+    const size_t views = filled_.size(), count = size_t(points_per_side) * points_per_side;
+    std::vector<float> points, angles, facing, distances(3 * count), around(views);
+    for (int row = 0; row < points_per_side; ++row)
+        for (int column = 0; column < points_per_side; ++column) {
+            Vector origin, direction;
+            probe.ray(probe.across(column, points_per_side), origin, direction);
+            const Vector point = pose.at(plus(origin, times(direction, probe.depth_mm(row, points_per_side))));
+            for (const double one : point) points.push_back(float(one));
+        }
+    for (const Pose& view : filled_) {
+        double trace = 0;
+        for (int d = 0; d < 3; ++d) trace += dot(pose.axis(d), view.axis(d));
+        angles.push_back(float(std::acos(std::clamp(0.5 * (trace - 1.0), -1.0, 1.0)) * (180.0 / kPi)));
+        facing.push_back(float(dot(pose.axis(1), view.axis(1))));  // below 0: front and back change places
+    }
+    std::vector<int64_t> place(count);
+    float *nearest = distances.data(), *before = nearest + count, *behind = before + count;
+    const ViewLimits limits{float(kSmallestMm), float(1e3 * kFarMm), kMmByDegree};
+    choose_kernels("auto").measure_views(points.data(), int(count), angles.data(), facing.data(),
+                                         images_of(probe_, axes_.data(), offsets_.data(), int64_t(views)), limits,
+                                         {nearest, before, behind, place.data(), around.data()});
+    ViewMeasures found;
+    for (size_t k = 0; k < count; ++k) {
+        const double a = before[k], b = behind[k];
+        found.nearest_mm.push_back(nearest[k]);
+        found.distance_mm.push_back(std::clamp(double(nearest[k]), kSmallestMm, kFarMm));
+        found.interpolation_mm.push_back(std::min(a * b / std::max(a + b, kLeastSum), kFarMm));
+        found.angle_deg.push_back(angles[place[k]]);
+    }
+    const double least = *std::min_element(around.begin(), around.begin() + count_);
+    const double reach = std::max(kNeighbourhoodMm, kReach * least);
+    double sum = 0;
+    for (size_t v = 0; v < count_; ++v) {
+        found.weights.push_back(std::exp(std::pow(least / reach, 2) - std::pow(around[v] / reach, 2)));
+        sum += found.weights.back();
+    }
+    for (double& weight : found.weights) weight /= sum;
+    return found;
+}
+
+ConfidenceModel ConfidenceModel::read(const Value& value) {
+    ConfidenceModel model;
+    constexpr int64_t kVersion = 2;
+    const Range positive{{}, {}, 0.0}, at_least_0{0.0, {}, {}}, share{0.0, 1.0, {}};
+    const auto unless_null = [](const auto& read) {
+        return [read](const Value& it) {
+            if (!it.json().is_null()) read(it);
+        };
+    };
+    Fields fields(value, "confidence");
+    fields.require("version", [&](const Value& it) { it.integer({double(kVersion), double(kVersion), {}}); });
+    fields.require("weights", [&](const Value& it) {
+        model.weights = it.vector<5>({});
+        for (size_t k = 1; k < model.weights.size(); ++k) it.at(k).number(at_least_0);
+    });
+    fields.require("black_ms_ssim", [&](const Value& it) { model.black_ms_ssim = it.number(share); });
+    fields.require("hardness", [&](const Value& it) { model.hardness = it.numbers({}, {}); });
+    fields.require("fitted_on", [&](const Value& it) { it.integer({1.0, {}, {}}); });
+    fields.require("error", [&](const Value& it) { it.number(share); });
+    fields.require("support", unless_null([&](const Value& it) {
+                       Fields support(it, "support");
+                       model.support.emplace();
+                       support.require("gain", [&](const Value& one) { model.support->gain = one.number(positive); });
+                       support.require("share", [&](const Value& one) { model.support->share = one.number(positive); });
+                       support.require("reach_mm",
+                                       [&](const Value& one) { model.support->reach_mm = one.number(positive); });
+                       support.end();
+                   }));
+    fields.require("fitted_to_mm", unless_null([&](const Value& it) { model.fitted_to_mm = it.number(at_least_0); }));
+    fields.require(
+        "uncertainty", unless_null([&](const Value& it) {
+            Fields uncertainty(it, "uncertainty");
+            model.uncertainty.emplace();
+            uncertainty.require("variances",
+                                [&](const Value& one) { model.uncertainty->variances = one.vector<10>(at_least_0); });
+            uncertainty.require("level", [&](const Value& one) { model.uncertainty->level = one.vector<8>(at_least_0); });
+            uncertainty.require("spread", [&](const Value& one) { model.uncertainty->spread = one.vector<8>(at_least_0); });
+            uncertainty.end();
+        }));
+    fields.end();
+    return model;
+}
+
+// c = b + (1 - b) mean over points of σ(w0 - w1 log(1 + i/0.3 mm) - w2 d/5 mm - w3 φ/10° - w4 h), limited by the support
+// that is expected at the pose.
+double ConfidenceModel::predict(const ViewMeasures& measures) const {
+    double hard = 0, sum = 0, within = 0;
+    for (size_t v = 0; v < hardness.size(); ++v) hard += measures.weights[v] * hardness[v];
+    const size_t count = measures.distance_mm.size();
+    for (size_t k = 0; k < count; ++k) {
+        double distance = measures.distance_mm[k];
+        if (support) within += std::exp(-std::pow(distance / support->reach_mm, 2));
+        if (fitted_to_mm) distance += std::max(distance - *fitted_to_mm, 0.0);
+        sum += logistic(weights[0] - weights[1] * std::log1p(measures.interpolation_mm[k] / kNearMm) -
+                        weights[2] * (distance / kDistanceMm) - weights[3] * (measures.angle_deg[k] / kAngleDeg) -
+                        weights[4] * hard);
+    }
+    const double expected = black_ms_ssim + (1.0 - black_ms_ssim) * (sum / double(count));
+    return support ? limited(expected, support->share * (within / double(count))) : expected;
+}
+
+double ConfidenceModel::limited(double confidence, double supported_share) const {
+    if (!support) return confidence;
+    return std::min(confidence, black_ms_ssim + (1.0 - black_ms_ssim) * std::min(1.0, support->gain * supported_share));
+}
+
+Extrapolation assess(const TrainingViews* views, const ConfidenceModel* model, const Pose& pose, const Probing& probe) {
+    Extrapolation found{kNaN, kNaN, kNaN, kNaN, kNaN};
+    if (views == nullptr) return found;
+    const ViewMeasures measures = views->measure(pose, probe, kPointsPerSide);
+    found.distance_mm = mean_of(measures.nearest_mm);
+    found.angle_deg = mean_of(measures.angle_deg);
+    if (model) found.confidence = model->predict(measures);
+    return found;
+}
+
+void add_support(Extrapolation& found, const ConfidenceModel* model, double supported_share) {
+    found.supported_share = supported_share;
+    if (model && !std::isnan(found.confidence)) found.confidence = model->limited(found.confidence, supported_share);
+}
+
+namespace {
+
+constexpr int kCells = 32, kDepths = 8;  // cells a side, no more than pixels
+
+using Map = std::vector<float>;
+
+// Means over h x w cells of equal size, which share pixels where these do not divide.
+Map in_cells(const Map& plane, int height, int width, int h, int w) {
+    Map means;
+    const auto first = [](int cell, int pixels, int cells) { return cell * pixels / cells; };
+    const auto last = [](int cell, int pixels, int cells) { return ((cell + 1) * pixels + cells - 1) / cells; };
+    for (int i = 0; i < h; ++i)
+        for (int j = 0; j < w; ++j) {
+            const int top = first(i, height, h), bottom = last(i, height, h);
+            const int left = first(j, width, w), right = last(j, width, w);
+            float sum = 0;
+            for (int row = top; row < bottom; ++row)
+                for (int column = left; column < right; ++column) sum += plane[size_t(row) * width + column];
+            means.push_back(sum / float(bottom - top) / float(right - left));
+        }
+    return means;
+}
+
+// Bilinear between the middles of h x w cells; beyond the outermost ones their values.
+Map interpolated(const Map& map, int h, int w, int height, int width) {
+    struct Place {
+        int low, high;
+        float share;
+    };
+    const auto places = [](int count, int cells) {
+        std::vector<Place> found;
+        for (int k = 0; k < count; ++k) {
+            const float at = std::max((k + 0.5f) * (float(cells) / float(count)) - 0.5f, 0.0f);
+            const int low = std::min(int(at), cells - 1);
+            found.push_back({low, std::min(low + 1, cells - 1), at - float(low)});
+        }
+        return found;
+    };
+    const std::vector<Place> rows = places(height, h), columns = places(width, w);
+    Map found;
+    for (const Place& i : rows)
+        for (const Place& j : columns) {
+            const float *above = &map[size_t(i.low) * w], *below = &map[size_t(i.high) * w];
+            const float upper = above[j.low] * (1.0f - j.share) + above[j.high] * j.share;
+            const float lower = below[j.low] * (1.0f - j.share) + below[j.high] * j.share;
+            found.push_back(upper * (1.0f - i.share) + lower * i.share);
+        }
+    return found;
+}
+
+}  // namespace
+
+// The variances that add up to that of a pixel's error, in cells: the terms are those of ultragray.rendering.derived, in
+// their order; V is the mean squared error of a pixel that shows the cell's mean where the true grey value may be any that
+// training images have at its depth.
+std::vector<float> deviations(const ConfidenceModel::Uncertainty& model, const ViewMeasures& measures, const Seen& seen,
+                              int height, int width) {
+    const int h = std::min(kCells, height), w = std::min(kCells, width);
+    Map squares;
+    for (const float grey : seen.bmode) squares.push_back(grey * grey);
+    const Map mean = in_cells(seen.bmode, height, width, h, w), square = in_cells(squares, height, width, h, w);
+    const Map coverage = in_cells(seen.coverage, height, width, h, w);
+    const Map transmittance = in_cells(seen.transmittance, height, width, h, w);
+    const auto over_cells = [&](const auto& values, int rows, int columns, int wide) {
+        return interpolated(Map(values.begin(), values.end()), rows, columns, h, wide);
+    };
+    const Map apart = over_cells(measures.interpolation_mm, kUncertaintyPoints, kUncertaintyPoints, w);
+    const Map away = over_cells(measures.distance_mm, kUncertaintyPoints, kUncertaintyPoints, w);
+    const Map level = over_cells(model.level, kDepths, 1, 1), spread = over_cells(model.spread, kDepths, 1, 1);
+    Map found;
+    for (size_t k = 0; k < mean.size(); ++k) {
+        const float grey = mean[k], off = level[k / w] - grey, unknown = spread[k / w] + off * off;
+        const float terms[10] = {1e-3f,
+                                 0.1f * grey,
+                                 grey * grey,
+                                 std::max(square[k] - grey * grey, 0.0f),
+                                 -std::expm1(-apart[k] / 0.3f) * unknown,
+                                 -std::expm1(-apart[k]) * unknown,
+                                 -std::expm1(-apart[k] / 3.0f) * unknown,
+                                 -std::expm1(-away[k] / 5.0f) * unknown,
+                                 (1.0f - coverage[k]) * unknown,
+                                 0.1f * (1.0f - transmittance[k]) * grey};
+        float sum = 0;
+        for (size_t term = 0; term < model.variances.size(); ++term) sum += float(model.variances[term]) * terms[term];
+        found.push_back(std::sqrt(std::clamp(sum, 0.0f, 1.0f)));
+    }
+    return interpolated(found, h, w, height, width);
+}
+
+}  // namespace ultragray::library

@@ -1,0 +1,46 @@
+// Contact of a probe with the skin under a scene's training views, and tissue under pressure (ultragray.rendering.contact).
+#pragma once
+
+#include "geometry.hpp"
+
+namespace ultragray::library {
+
+// Heights of the outermost and the innermost training face over a plane, in cells.
+class Skin {
+ public:
+    // Under the training views of a probe. Throws Fault where there is none: no views or no probe are known, or they look
+    // all around.
+    Skin(const std::vector<Pose>& poses, const std::optional<Probe>& probe);
+
+    // The way from points to the skin at rest along unit directions, mm, less than 0 where it lies behind; infinite where no
+    // skin is known, and along a direction that does not run into the body.
+    std::vector<double> gaps_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const;
+    // How far points lie beyond the innermost training face, mm, at least 0.
+    std::vector<double> pressed_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const;
+
+ private:
+    void settle(const std::vector<Vector>& points);
+    std::vector<double> distances_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions,
+                                     const std::vector<float>& heights) const;
+    Vector along_axes(const Vector& v) const { return {dot(axes_[0], v), dot(axes_[1], v), dot(axes_[2], v)}; }
+
+    Vector origin_, axes_[3];  // the centre of the first cell, at height 0; along rows, along columns, out of the body
+    double cell_mm_;
+    int rows_, columns_;
+    std::vector<float> outermost_, innermost_;  // [rows, columns] mm
+    std::vector<bool> known_;                   // a face was near
+};
+
+// Where the scan lines of one pose meet the skin.
+struct Touch {
+    Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width);
+
+    std::vector<bool> lines;  // [W]: those that have contact
+    double share;             // of them
+    double pressed_mm;        // how far the face lies beyond the innermost training face, a mean over these
+};
+
+// The probe, and in `motion_mm` the way to it in its own frame, that sees tissue at rest as this one sees it pressed.
+Probing at_rest(const Probing& probe, double pressed_mm, Vector& motion_mm);
+
+}  // namespace ultragray::library
