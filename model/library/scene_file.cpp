@@ -5,6 +5,8 @@
 #include <cstring>
 #include <map>
 
+#include "compressed.hpp"
+
 namespace ultragray::library {
 namespace {
 
@@ -12,6 +14,7 @@ constexpr uint64_t kMostHeader = uint64_t(4) << 20, kNoHeader = uint64_t(1) << 4
 constexpr int64_t kMostPoses = 100'000;
 constexpr float kMostMean = 1e6f, kMostLogScale = 20.0f, kMostOther = 1e6f, kLeastNorm = 1e-6f;
 constexpr int kFormatVersion = 1;
+constexpr uint32_t kCompressedFormat = 1;
 
 struct Tensor {
     std::string type;
@@ -25,10 +28,10 @@ std::string in_words(const Tensor& tensor) {
     return tensor.type + " [" + sides + "]";
 }
 
-// The tensors of a bundle by name, and its metadata.
+// The tensors of a bundle by name, and its metadata. Of the beginning of one, data is null of those that it cuts.
 class Bundle {
  public:
-    Bundle(const unsigned char* bytes, size_t size) {
+    Bundle(const unsigned char* bytes, size_t size, Extent extent) : extent_(extent) {
         uint64_t length = 0;
         if (size < sizeof length) throw Fault("it is cut off: a scene file has at least 8 bytes");
         for (size_t k = 0; k < sizeof length; ++k) length |= uint64_t(bytes[k]) << (8 * k);
@@ -58,13 +61,63 @@ class Bundle {
             throw Fault("it is a safetensors file, but not one of ultragray's");
         return metadata_["ultragray"].get<std::string>();
     }
+    bool is_compressed() const { return has("compressed"); }
+    // Throws Fault where the description or the poses of a compressed file are damaged.
+    void check_checksum() const {
+        const std::vector<uint8_t> says = values<uint8_t>(at("compressed", "U8", {8}));
+        const std::string description = this->description();
+        uint32_t found[] = {kCompressedFormat, checksum(description.data(), description.size())}, given[2];
+        for (const char* name : {"training_poses", "pose_corrections", "rest_poses"})
+            if (has(name)) {
+                const Tensor& poses = at(name, "F64", tensors_.at(name).shape);
+                found[1] = checksum(poses.data, size_of(poses), found[1]);
+            }
+        std::memcpy(given, says.data(), sizeof given);
+        if (given[0] != found[0])
+            throw Fault("it is compressed in another format version than " + std::to_string(kCompressedFormat));
+        if (given[1] != found[1]) throw Fault("its description or its poses are damaged: their checksum differs");
+    }
+    // The Gaussians of its parts: of all of them, or of those that are there.
+    Parameters parts(int64_t count, int64_t terms, bool has_labels) const {
+        Parameters gaussians;
+        gaussians.terms = terms - 1;
+        gaussians.has_labels = has_labels;
+        int64_t left = count;
+        for (int index = 0; index < 100; ++index) {
+            char name[16];
+            std::snprintf(name, sizeof name, "part.%02d", index);
+            if (!has(name) || (index > 0 && tensors_.at(name).data == nullptr)) break;
+            const Tensor& part = at(name, "U8", {tensors_.at(name).shape.empty() ? 0 : tensors_.at(name).shape[0]});
+            append_part(gaussians, part.data, size_t(part.shape[0]), left, name);
+            left = count - int64_t(gaussians.sh0.size());
+        }
+        if (left == count || (left > 0 && extent_ == Extent::Whole))
+            throw Fault("its parts hold " + std::to_string(count - left) + " Gaussians, its description says " +
+                        std::to_string(count));
+        return gaussians;
+    }
     bool has(const std::string& name) const { return tensors_.count(name) > 0; }
     const Tensor& at(const std::string& name, const std::string& type, const std::vector<int64_t>& shape) const {
         if (!has(name)) throw Fault("its tensor " + name + " is missing");
         const Tensor& found = tensors_.at(name);
         if (found.type != type || found.shape != shape)
             throw Fault("its tensor " + name + " is " + in_words(found) + ", expected " + in_words({type, shape, nullptr}));
+        if (found.data == nullptr) throw Fault("it is cut off: its header tells of more");
         return found;
+    }
+    // The Gaussians of a file that is not compressed.
+    Parameters whole(int64_t count, int64_t terms, bool has_labels) const {
+        if (extent_ == Extent::Beginning) throw Fault("only compressed scene files (.ugz) can be read in parts");
+        const auto labels = has_labels ? values<uint8_t>(at("labels", "U8", {count})) : std::vector<uint8_t>();
+        return {terms - 1,
+                has_labels,
+                floats("means", {count, 3}),
+                floats("scales", {count, 3}),
+                floats("quats", {count, 4}),
+                floats("transmittances", {count}),
+                floats("sh0", {count, 1, 1}),
+                floats("shN", {count, terms - 1, 1}),
+                labels};
     }
     std::vector<float> floats(const std::string& name, const std::vector<int64_t>& shape) const {
         return values<float>(at(name, "F32", shape));
@@ -82,10 +135,8 @@ class Bundle {
     }
     template <class Number>
     static std::vector<Number> values(const Tensor& tensor) {
-        int64_t count = 1;
-        for (const int64_t side : tensor.shape) count *= side;
-        std::vector<Number> found(count);
-        std::memcpy(found.data(), tensor.data, count * sizeof(Number));
+        std::vector<Number> found(size_of(tensor) / sizeof(Number));
+        std::memcpy(found.data(), tensor.data, size_of(tensor));
         return found;
     }
     static Json parsed(const char* first, const char* last, const std::string& problem) {
@@ -95,18 +146,26 @@ class Bundle {
     }
 
  private:
-    static Tensor tensor_of(const std::string& name, const Json& one, const unsigned char* data, uint64_t room) {
+    static const std::map<std::string, int64_t>& sizes() {
         static const std::map<std::string, int64_t> kSizes = {{"F32", 4}, {"F64", 8}, {"U8", 1}};
+        return kSizes;
+    }
+    static size_t size_of(const Tensor& tensor) {
+        int64_t bytes = sizes().at(tensor.type);
+        for (const int64_t side : tensor.shape) bytes *= side;
+        return size_t(bytes);
+    }
+    Tensor tensor_of(const std::string& name, const Json& one, const unsigned char* data, uint64_t room) const {
         const auto wrong = [&] { return Fault("its header does not describe the tensor " + name); };
         if (!one.is_object() || !one.contains("dtype") || !one.contains("shape") || !one.contains("data_offsets"))
             throw wrong();
         const Json &type = one["dtype"], &shape = one["shape"], &offsets = one["data_offsets"];
-        if (!type.is_string() || !kSizes.count(type.get<std::string>()) || !shape.is_array() || shape.size() > 3 ||
+        if (!type.is_string() || !sizes().count(type.get<std::string>()) || !shape.is_array() || shape.size() > 3 ||
             !offsets.is_array() || offsets.size() != 2 || !offsets[0].is_number_unsigned() ||
             !offsets[1].is_number_unsigned())
             throw wrong();
         Tensor tensor{type.get<std::string>(), {}, nullptr};
-        int64_t bytes = kSizes.at(tensor.type);
+        int64_t bytes = sizes().at(tensor.type);
         for (const Json& side : shape) {
             if (!side.is_number_unsigned() || side.get<uint64_t>() > kNoHeader) throw wrong();
             tensor.shape.push_back(side.get<int64_t>());
@@ -114,11 +173,14 @@ class Bundle {
         }
         const uint64_t begin = offsets[0].get<uint64_t>(), end = offsets[1].get<uint64_t>();
         if (begin > end || end - begin != uint64_t(bytes)) throw wrong();
-        if (end > room) throw Fault("it is cut off: its header tells of more");
-        tensor.data = data + begin;
+        if (end <= room)
+            tensor.data = data + begin;
+        else if (extent_ == Extent::Whole)
+            throw Fault("it is cut off: its header tells of more");
         return tensor;
     }
 
+    Extent extent_;
     std::map<std::string, Tensor> tensors_;
     Json metadata_;
 };
@@ -186,35 +248,44 @@ std::unique_ptr<PreparedScene> part_of(const std::vector<uint8_t>& labels, int l
 
 }  // namespace
 
-Scene Scene::read(const void* bytes, size_t size) {
-    const Bundle bundle(static_cast<const unsigned char*>(bytes), size);
+Scene Scene::read(const void* bytes, size_t size, Extent extent) {
+    const Bundle bundle(static_cast<const unsigned char*>(bytes), size, extent);
     Scene scene;
     SceneInfo& info = scene.info;
     info = info_of(bundle.description());
-    const int64_t n = info.gaussian_count, terms = int64_t(info.sh_degree + 1) * (info.sh_degree + 1);
-    if (n == 0) throw Fault("it holds no Gaussians");
-    const auto means = bundle.floats("means", {n, 3}), scales = bundle.floats("scales", {n, 3});
-    const auto quats = bundle.floats("quats", {n, 4}), transmittances = bundle.floats("transmittances", {n});
-    const auto sh0 = bundle.floats("sh0", {n, 1, 1}), shn = bundle.floats("shN", {n, terms - 1, 1});
-    check_values("means", means, n, kMostMean);
-    check_values("scales", scales, n, kMostLogScale);
-    check_values("quats", quats, n, kMostOther);
-    check_values("transmittances", transmittances, n, kMostOther);
-    check_values("sh0", sh0, n, kMostOther);
-    check_values("shN", shn, n, kMostOther);
+    if (bundle.is_compressed()) bundle.check_checksum();
+    const int64_t whole = info.gaussian_count, terms = int64_t(info.sh_degree + 1) * (info.sh_degree + 1);
+    if (whole == 0) throw Fault("it holds no Gaussians");
+    const bool has_labels = !info.label_names.empty();
+    Parameters all =
+        bundle.is_compressed() ? bundle.parts(whole, terms, has_labels) : bundle.whole(whole, terms, has_labels);
+    const int64_t n = int64_t(all.sh0.size());
+    if (n < whole)  // where the small ones have not come, the large ones fill their place: a measured power of the share
+        for (float& scale : all.scales) scale += float(std::log(double(whole) / double(n)) / 8.0);
+    check_values("means", all.means, n, kMostMean);
+    check_values("scales", all.scales, n, kMostLogScale);
+    check_values("quats", all.quats, n, kMostOther);
+    check_values("transmittances", all.transmittances, n, kMostOther);
+    check_values("sh0", all.sh0, n, kMostOther);
+    check_values("shN", all.shn, n, kMostOther);
     for (int64_t i = 0; i < n; ++i) {
-        const float* q = &quats[4 * i];
+        const float* q = &all.quats[4 * i];
         if (std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) < kLeastNorm)
             throw Fault("splats['quats'] must not be zero, got zero for Gaussian " + std::to_string(i));
     }
-    const RawSplats raw{means.data(),   scales.data(),  quats.data(), transmittances.data(), sh0.data(), shn.data(), n,
-                        info.sh_degree, info.intensity, false};
+    const RawSplats raw{all.means.data(),
+                        all.scales.data(),
+                        all.quats.data(),
+                        all.transmittances.data(),
+                        all.sh0.data(),
+                        all.shn.data(),
+                        n,
+                        info.sh_degree,
+                        info.intensity,
+                        false};
     scene.gaussians = std::make_unique<PreparedScene>(raw, Order::Sorted, 1);
-    if (!info.label_names.empty()) {
-        const std::vector<uint8_t> labels = Bundle::values<uint8_t>(bundle.at("labels", "U8", {n}));
-        for (int label = 0; label < 256; ++label)
-            if (auto part = part_of(labels, label, raw)) scene.parts.emplace_back(label, std::move(part));
-    }
+    for (int label = 0; label < 256 && has_labels; ++label)
+        if (auto part = part_of(all.labels, label, raw)) scene.parts.emplace_back(label, std::move(part));
     scene.training_poses = bundle.poses("training_poses");
     scene.rest_poses = bundle.poses("rest_poses");
     scene.errors = bundle.poses("pose_corrections");

@@ -25,6 +25,9 @@ struct SceneInfo {
     std::string json;  // all of it, as the file has it
 };
 
+// How much of a file is at hand: of the beginning of a compressed one, those parts are read that it holds.
+enum class Extent { Whole, Beginning };
+
 // A scene, ready to be drawn.
 struct Scene {
     SceneInfo info;
@@ -33,7 +36,7 @@ struct Scene {
     std::vector<Pose> training_poses, rest_poses, errors;               // [P] each, or none
 
     // Copies what it needs. Throws Fault: what is wrong with the file, in a sentence.
-    static Scene read(const void* bytes, size_t size);
+    static Scene read(const void* bytes, size_t size, Extent extent);
 };
 
 }  // namespace ultragray::library

@@ -34,14 +34,18 @@ Result guarded(Result failed, const Act& act) {
     return failed;
 }
 
-}  // namespace
-
-ultragray_scene* ultragray_load(const void* bytes, size_t size) {
+ultragray_scene* read(const void* bytes, size_t size, Extent extent) {
     return guarded<ultragray_scene*>(nullptr, [&] {
         if (bytes == nullptr) throw Fault("there are no bytes of a scene file");
-        return new ultragray_scene{std::make_shared<LoadedScene>(Scene::read(bytes, size))};
+        return new ultragray_scene{std::make_shared<LoadedScene>(Scene::read(bytes, size, extent))};
     });
 }
+
+}  // namespace
+
+ultragray_scene* ultragray_load(const void* bytes, size_t size) { return read(bytes, size, Extent::Whole); }
+
+ultragray_scene* ultragray_load_part(const void* bytes, size_t size) { return read(bytes, size, Extent::Beginning); }
 
 const char* ultragray_scene_info(const ultragray_scene* scene) { return scene->scene->scene.info.json.c_str(); }
 

@@ -27,8 +27,10 @@ extern "C" {
 typedef struct ultragray_scene ultragray_scene; /* the Gaussians of a scene file, and what it says of itself */
 typedef struct ultragray_view ultragray_view;   /* settings of frames of one scene */
 
-/* A scene of the bytes of a scene file (.ugr), which are copied. */
+/* A scene of the bytes of a scene file (.ugr, or .ugz: compressed), which are copied. */
 ULTRAGRAY_API ultragray_scene *ultragray_load(const void *bytes, size_t size);
+/* A coarser scene of the first bytes of a compressed one (.ugz): of those of its parts that they hold whole. */
+ULTRAGRAY_API ultragray_scene *ultragray_load_part(const void *bytes, size_t size);
 /* What the scene says of itself: JSON, as long as the scene is there. */
 ULTRAGRAY_API const char *ultragray_scene_info(const ultragray_scene *scene);
 /* NULL is allowed. Views of the scene stay usable. */

@@ -34,7 +34,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
+from ultragray_service.views.prepared import Comparisons, CompressedScenes, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import RenderPool
@@ -76,6 +76,7 @@ class Service:
     dataset_views: DatasetViews
     comparisons: Comparisons
     thumbnails: Thumbnails
+    compressed: CompressedScenes
     training_views: TrainingViews
     # How it goes.
     readiness: Readiness
@@ -84,7 +85,7 @@ class Service:
 
     def __post_init__(self) -> None:
         self._of_datasets = (self.dataset_views, self.comparisons, self.training_views)
-        self._prepared = (*self._of_datasets, self.thumbnails)
+        self._prepared = (*self._of_datasets, self.thumbnails, self.compressed)
         self._following: list[asyncio.Task[None]] = []
         self._snapshot: Snapshot | None = None
 

@@ -30,7 +30,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
+from ultragray_service.views.prepared import Comparisons, CompressedScenes, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
@@ -111,6 +111,7 @@ def make_service(settings: Settings) -> Service:
         dataset_views=DatasetViews(datasets, settings, pictures),
         comparisons=Comparisons(scenes, catalog, datasets, settings, pictures),
         thumbnails=Thumbnails(scenes, catalog, settings, thumbnails),
+        compressed=CompressedScenes(scenes, settings, thumbnails),
         training_views=TrainingViews(jobs, datasets, settings, pictures),
         readiness=Readiness(
             lambda: jobs.database,

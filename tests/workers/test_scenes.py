@@ -4,6 +4,7 @@ import weakref
 
 import pytest
 
+from ultragray import GaussianScene
 from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray_workers import SceneStore
 from ultragray_workers import scene_shelf as headers
@@ -44,6 +45,21 @@ def test_the_first_folder_wins_over_further_ones(scene_folder, tmp_path):
     assert store.header("c").info == store.header("a").info
     (scene_folder / "b.ugr").unlink()
     assert store.path("b") == further / "b.ugr"
+
+
+def test_compressed_scenes_are_served_too_unless_there_is_another_of_the_name(scene_folder, tmp_path):
+    GaussianScene.load(scene_folder / "b.ugr").save(scene_folder / "b.ugz")
+    GaussianScene.load(scene_folder / "b.ugr").save(scene_folder / "c.ugz")
+    store = SceneStore(scene_folder)
+    assert store.names() == ["a", "b", "c"]
+    assert (store.path("b").name, store.path("c").name) == ("b.ugr", "c.ugz")
+    assert (store.header("b").is_compressed, store.header("c").is_compressed) == (False, True)
+    (scene_folder / "b.ugr").unlink()
+    assert store.header("b").is_compressed
+    (shelf,) = store.shelves
+    shelf.replace(scene_folder / "a.ugr", "c")
+    assert not (scene_folder / "c.ugz").exists()
+    assert not store.header("c").is_compressed
 
 
 @pytest.mark.parametrize("name", ["c", "", "../a", "/etc/passwd", "a.ugr", "a/../a", "a\0", "x" * 200])

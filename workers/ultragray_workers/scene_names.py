@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ultragray.errors import InvalidArgument
+from ultragray.scene.compressed import COMPRESSED_SUFFIX
 
 SUFFIX = ".ugr"
+SUFFIXES = (SUFFIX, COMPRESSED_SUFFIX)  # what is in a file, and not its name, says whether it is compressed
 LEAST_PIN = 12  # digits
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _PIN = re.compile(rf"[0-9a-f]{{{LEAST_PIN},64}}")

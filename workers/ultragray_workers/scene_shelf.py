@@ -1,6 +1,7 @@
 """The scenes of a storage, by name: where the file of each is, and how one is added, fetched and removed.
 
 PREFIX/NAME.ugr              a scene as an operator copied it there, or in a folder as it was imported or made
+PREFIX/NAME.ugz              likewise, where there is no NAME.ugr
 PREFIX/NAME.json             a scene that was imported or made in a bucket: {"format_version", "sha256", "bytes", …}
 PREFIX/objects/SHA256.ugr    the file of such scenes, which never changes
 
@@ -38,7 +39,7 @@ from ultragray.scene.info import (
 from ultragray_workers.claims import claimed_folder, remove_abandoned
 from ultragray_workers.errors import SceneExists, StorageUnavailable
 from ultragray_workers.rounds import Rounds
-from ultragray_workers.scene_names import SUFFIX, is_scene_name
+from ultragray_workers.scene_names import SUFFIX, SUFFIXES, is_scene_name
 from ultragray_workers.storage.cache import Cache, Pin, cache_name
 from ultragray_workers.storage.storage import Damaged, Entry, NotThere, Storage
 
@@ -212,6 +213,8 @@ class SceneShelf:
             self.storage.upload(file, self._key(f"{name}{SUFFIX}"))
             if there is not None and there.sha256 is not None:  # of a folder that was copied from a bucket
                 self.storage.delete(self._entry_key(name))
+            elif there is not None and there.key != self._key(f"{name}{SUFFIX}"):
+                self.storage.delete(there.key)
         else:
             sha256, size = file_sha256(file), file.stat().st_size
             self._upload(file, self._object(sha256))
@@ -242,8 +245,9 @@ class SceneShelf:
 
     def look_up(self, name: str) -> Placed | None:
         """One scene as it is now."""
-        if (copied := self.storage.entry(self._key(f"{name}{SUFFIX}"))) is not None:
-            return Placed(copied.key, copied.version, copied.bytes, None)
+        for suffix in SUFFIXES:
+            if (copied := self.storage.entry(self._key(f"{name}{suffix}"))) is not None:
+                return Placed(copied.key, copied.version, copied.bytes, None)
         return self._read_entry(self._entry_key(name))
 
     def read(self) -> None:
@@ -301,9 +305,9 @@ class SceneShelf:
             self.storage.upload(file, key)
 
     def _near_file(self, name: str) -> Path | None:
-        """The file that has the name of a scene in a near storage, by one look at the disk."""
-        path = self.storage.in_place(self._key(f"{name}{SUFFIX}"))
-        return path if path is not None and path.is_file() else None
+        """The file that has the name of a scene in a near storage, by one or two looks at the disk."""
+        paths = (self.storage.in_place(self._key(f"{name}{suffix}")) for suffix in SUFFIXES)
+        return next((path for path in paths if path is not None and path.is_file()), None)
 
     def _known_as(self, name: str) -> Placed | None:
         """One scene as it was found last; None where that is too long ago."""
@@ -375,8 +379,9 @@ class SceneShelf:
         named: dict[str, Entry] = {}
         for entry in self.storage.entries_in(self._prefix):
             path = PurePosixPath(entry.key)
-            if is_scene_name(path.stem) and path.suffix == SUFFIX:
-                copied[path.stem] = Placed(entry.key, entry.version, entry.bytes, None)
+            if is_scene_name(path.stem) and path.suffix in SUFFIXES:
+                if path.suffix == SUFFIX or path.stem not in copied:
+                    copied[path.stem] = Placed(entry.key, entry.version, entry.bytes, None)
             elif is_scene_name(path.stem) and path.suffix == ENTRY_SUFFIX:
                 named[path.stem] = entry
         known = {name: self._entries[name] for name in named if name in self._entries}
@@ -514,7 +519,4 @@ class KeptHeaders:
 
 def _described_bytes(header: SceneHeader) -> int:
     """Of a scene file without its Gaussians, as what is read from it: text becomes objects."""
-    bytes_per_gaussian = 4 * floats_per_gaussian(header.info) + bool(header.info.label_names)
-    gaussians_bytes = bytes_per_gaussian * header.info.gaussian_count
-    text_bytes = header.file_bytes - gaussians_bytes - header.training_poses.nbytes
-    return header.training_poses.nbytes + _OBJECT_BYTES_PER_TEXT_BYTE * max(text_bytes, 0)
+    return header.training_poses.nbytes + _OBJECT_BYTES_PER_TEXT_BYTE * header.text_bytes

@@ -90,6 +90,9 @@ THUMBNAIL_NAME = "thumbnail.png"
 THUMBNAIL_SIDE = 128  # scan lines, samples, and pixels of the longer side
 
 
+COMPRESSED_NAME = "scene.ugz"
+
+
 def draw_thumbnail(folder: str, scene_path: str, **_places: object) -> None:
     """Write the middle view of the training sweep of a scene, which knows its probe, into `folder`.
 
@@ -109,6 +112,13 @@ def draw_thumbnail(folder: str, scene_path: str, **_places: object) -> None:
         frames = render(scene, probe, pose, height=side, width=side, outputs=("bmode",), backend="cpu")
     picture = with_square_pixels(frames["bmode"][0].numpy(), probe, side)
     (Path(folder) / THUMBNAIL_NAME).write_bytes(encoded_image(to_uint8(picture), Encoding.PNG))
+
+
+def compress_scene(folder: str, scene_path: str, **_places: object) -> None:
+    """Write a scene, compressed, into `folder`. Raises SceneFileInvalid."""
+    from ultragray.scene.gaussians import GaussianScene
+
+    GaussianScene.load(scene_path).save(Path(folder) / COMPRESSED_NAME)
 
 
 # Work of a helper process: comparing a scene with the held-out frames of the dataset that it was trained from.

@@ -1,4 +1,4 @@
-"""A scene as a page: files that any web server hands out, in which a browser renders every frame itself. Free of torch.
+"""A scene as a page: files that any web server hands out, in which a browser renders every frame itself.
 
 The page and the renderer, libultragray in WebAssembly, are built by `make browser` from the folder `browser`.
 """
@@ -40,7 +40,7 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
         made.chmod(0o755)
         for asset in ASSETS.iterdir():
             shutil.copyfile(asset, made / asset.name)
-        shutil.copyfile(scene, made / "scene.ugr")
+        _write_compressed(header, scene, made / "scene.ugz")
         (made / "page.json").write_text(json.dumps(_described(header, scene.stem)), encoding="utf-8")
         for path in made.iterdir():
             sync(path)
@@ -50,6 +50,15 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
         shutil.rmtree(made, ignore_errors=True)
         raise
     return sorted(folder.iterdir())
+
+
+def _write_compressed(header: SceneHeader, scene: Path, path: Path) -> None:
+    if header.is_compressed:
+        shutil.copyfile(scene, path)
+        return
+    from ultragray.scene.gaussians import GaussianScene  # and torch with it
+
+    GaussianScene.load(scene).save(path)
 
 
 def _described(header: SceneHeader, name: str) -> dict[str, object]:

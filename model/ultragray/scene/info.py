@@ -3,7 +3,8 @@
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
 [N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm; where these were corrected,
 pose_corrections likewise; where tissue followed the probe, rest_poses likewise; and, where the Gaussians carry labels,
-labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
+labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo. In a compressed
+one (.ugz) the tensors `compressed`, part.00, part.01 … (see `compressed`) stand in the place of those of the Gaussians.
 All but the Gaussians is bounded, so that the description of any file is read in little memory and time.
 """
 
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 
 from ultragray.contract import Contract, checked_number, described, from_dict, to_dict, under
@@ -23,6 +25,7 @@ from ultragray.files import require_version
 from ultragray.geometry.image_size import DEFAULT_IMAGE_SIDE
 from ultragray.geometry.pose import MAX_POSITION_MM, check_poses
 from ultragray.geometry.probe import PLANE, ElevationBeam, FloatArray, Probe
+from ultragray.scene.compressed import COMPRESSED_TENSOR, MAX_PARTS, check_tensor, part_name, unpack
 from ultragray.scene.confidence import read_model
 from ultragray.scene.speckle import SpeckleModel
 
@@ -176,6 +179,8 @@ class SceneHeader:
     pose_corrections: FloatArray | None = field(default=None, repr=False)
     # [P, 4, 4] mm: where the tissue at rest looks as the training frames do; None: at the training poses
     rest_poses: FloatArray | None = field(default=None, repr=False)
+    is_compressed: bool = field(default=False, repr=False)
+    text_bytes: int = field(default=0, repr=False)  # of the bundle's header: the description, and where each tensor is
 
 
 def read_header(path: str | Path) -> SceneHeader:
@@ -187,13 +192,15 @@ def read_header(path: str | Path) -> SceneHeader:
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
-            check_header_size(file.read(_LENGTH_BYTES))
+            text_bytes = _LENGTH_BYTES + check_header_size(file.read(_LENGTH_BYTES))
         with safe_open(path, framework="numpy") as bundle:
             metadata = bundle.metadata() or {}
             if METADATA_KEY not in metadata:
                 raise ValueError("it is a safetensors file, but not one of ultragray's")
             info = info_from_json(metadata[METADATA_KEY])
-            _check_tensors(bundle, info)
+            is_compressed = COMPRESSED_TENSOR in bundle.keys()  # noqa: SIM118
+            (_check_parts if is_compressed else _check_gaussians)(bundle, info)
+            _check_poses(bundle)
             poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
             beside = {
                 name: check_beside(name, bundle.get_tensor(name), len(poses)) if name in bundle.keys() else None  # noqa: SIM118
@@ -201,9 +208,26 @@ def read_header(path: str | Path) -> SceneHeader:
             }
             check_tissue(info, beside[REST_TENSOR])
             read_model(info.confidence, len(poses))
+            if is_compressed:
+                found = bundle.get_tensor(COMPRESSED_TENSOR).tobytes()
+                check_tensor(found, metadata[METADATA_KEY], poses, *beside.values())
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
-    return SceneHeader(info=info, training_poses=poses, file_bytes=size, **beside)
+    return SceneHeader(info, poses, size, **beside, is_compressed=is_compressed, text_bytes=text_bytes)
+
+
+def read_gaussians(path: str | Path, info: SceneInfo) -> dict[str, npt.NDArray[Any]]:
+    """The raw parameters [N, ...] of a scene file of this description and, where it names some, its labels [N].
+
+    Raises OSError, SafetensorError, ValueError where the file is damaged, or another than the one described.
+    """
+    with safe_open(path, framework="numpy") as bundle:
+        names = set(bundle.keys()) - {COMPRESSED_TENSOR, "training_poses", *BESIDE}
+        tensors = {name: bundle.get_tensor(name) for name in sorted(names)}
+        if COMPRESSED_TENSOR not in bundle.keys():  # noqa: SIM118
+            return tensors
+    parts = [part.tobytes() for part in tensors.values()]
+    return unpack(parts, info.gaussian_count, info.sh_degree, bool(info.label_names))
 
 
 def check_beside(name: str, motions: Any, count: int) -> FloatArray:  # [P, 4, 4] mm
@@ -226,13 +250,14 @@ def check_tissue(info: SceneInfo, rest_poses: FloatArray | None) -> None:
         )
 
 
-def check_header_size(start: bytes) -> None:
-    """Raises InvalidArgument where a bundle that starts so has a larger header than that of a scene may be."""
+def check_header_size(start: bytes) -> int:
+    """The bytes of the header of a bundle that starts so. Raises InvalidArgument for more than a scene's may have."""
     size = int.from_bytes(start[:_LENGTH_BYTES], "little")
     if size > _NO_HEADER_BYTES:
         raise InvalidArgument("it does not begin as a scene file does: it is damaged, or a file of another kind")
     if size > MAX_HEADER_BYTES:
         raise InvalidArgument(f"the header of a scene file may have {MAX_HEADER_BYTES} bytes, it says {size}")
+    return size
 
 
 def check_training_pose_count(count: int) -> None:
@@ -242,22 +267,39 @@ def check_training_pose_count(count: int) -> None:
         )
 
 
-def _check_tensors(bundle: Any, info: SceneInfo) -> None:
-    if not info.gaussian_count:
-        raise ValueError("it holds no Gaussians")
-    names = set(bundle.keys())
+def _check_gaussians(bundle: Any, info: SceneInfo) -> None:
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
     if info.label_names:
         shapes[LABELS_TENSOR] = (info.gaussian_count,)
-    if names - set(BESIDE) != {*shapes, "training_poses"}:
-        raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
+    _check_names(bundle, info, [*shapes])
     for name, shape in shapes.items():
         part, dtype = bundle.get_slice(name), "U8" if name == LABELS_TENSOR else "F32"
         if tuple(part.get_shape()) != shape or part.get_dtype() != dtype:
             raise ValueError(
                 f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected {dtype} {list(shape)}"
             )
-    for name in sorted(names - set(shapes)):
+
+
+def _check_parts(bundle: Any, info: SceneInfo) -> None:
+    count = len(set(bundle.keys()) - {COMPRESSED_TENSOR, "training_poses", *BESIDE})
+    names = [COMPRESSED_TENSOR, *(part_name(index) for index in range(min(max(count, 1), MAX_PARTS)))]
+    _check_names(bundle, info, names)
+    for name in names:
+        part = bundle.get_slice(name)
+        if part.get_dtype() != "U8" or len(part.get_shape()) != 1:
+            raise ValueError(f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected U8 [bytes]")
+
+
+def _check_names(bundle: Any, info: SceneInfo, of_gaussians: list[str]) -> None:
+    if not info.gaussian_count:
+        raise ValueError("it holds no Gaussians")
+    names, expected = set(bundle.keys()), sorted([*of_gaussians, "training_poses"])
+    if names - set(BESIDE) != set(expected):
+        raise ValueError(f"its tensors are {sorted(names)}, expected {expected}")
+
+
+def _check_poses(bundle: Any) -> None:
+    for name in sorted(set(bundle.keys()) & {"training_poses", *BESIDE}):
         poses = bundle.get_slice(name)
         if poses.get_dtype() != "F64" or len(poses.get_shape()) != 3:
             raise ValueError(

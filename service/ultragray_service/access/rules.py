@@ -81,7 +81,7 @@ OPERATIONS = (
         "SceneService/GetScene",
         "RenderService/AssessPoses",
     ),
-    _operation("scene.download", _READER, "GET /v1/scenes/{scene}/file"),
+    _operation("scene.download", _READER, "GET /v1/scenes/{scene}/file", "GET /v1/scenes/{scene}/file.ugz"),
     _operation("scene.load", _OPERATOR, "POST /v1/scenes/{scene}:load", "SceneService/LoadScene"),
     _operation("scene.unload", _OPERATOR, "POST /v1/scenes/{scene}:unload", "SceneService/UnloadScene"),
     _operation(

@@ -32,6 +32,7 @@ from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, W
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
 from ultragray_service.cli.terminal import (
+    COMPRESSED_SUFFIX,
     OR_A_FOLDER,
     SCENE_SUFFIX,
     Force,
@@ -179,7 +180,7 @@ _scenes.add_show(
 @with_connection
 def upload_scene(
     connection: Connection,
-    file: Annotated[Path, argument("Scene file (.ugr).")],
+    file: Annotated[Path, argument("Scene file (.ugr or .ugz).")],
     name: Annotated[str | None, option("Name of the scene.", shown="that of the file")] = None,
     private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
@@ -193,20 +194,26 @@ def upload_scene(
     tell(f"uploaded {called}: {scene['gaussian_count']:,} Gaussians", scene, as_json=json)
 
 
-@scenes_app.command("download", epilog=examples("ultragray scenes download demo -o demo.ugr"))
+@scenes_app.command(
+    "download",
+    epilog=examples("ultragray scenes download demo", "ultragray scenes download demo -o demo.ugz"),
+)
 @with_connection
 def download_scene(
     connection: Connection,
     name: NameArgument,
-    output: Annotated[Path | None, output_option("Scene file to write (.ugr).", default="NAME.ugr, here")] = None,
+    output: Annotated[
+        Path | None, output_option("Scene file to write (.ugr, or .ugz: compressed).", default="NAME.ugr, here")
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Download a scene file."""
     path = Path(f"{name}{SCENE_SUFFIX}") if output is None else output
-    check_file(path, [SCENE_SUFFIX], force=force)
+    check_file(path, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
     with transferred(f"downloading {name}") as begin:
-        size = connection.download(route("scenes", name, "file"), path, begin)
+        form = "file" if path.suffix == SCENE_SUFFIX else "file.ugz"
+        size = connection.download(route("scenes", name, form), path, begin)
     tell(f"wrote {path}: {size:,} bytes", {"output": str(path), "bytes": size}, as_json=json)
 
 

@@ -20,6 +20,7 @@ from ultragray.scene.info import SceneInfo, read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING, read_dataset
 from ultragray_service.cli.terminal import (
+    COMPRESSED_SUFFIX,
     SCENE_SUFFIX,
     Force,
     Json,
@@ -66,7 +67,7 @@ def demo(
 )
 @with_options
 def show(
-    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE")],
+    file: Annotated[str, argument(f"A scene file (.ugr or .ugz), or a sweep: {SWEEP_MEANING}.", metavar="FILE")],
     json: Json = False,
     *,
     source: SourceOptions,
@@ -75,7 +76,7 @@ def show(
 
     What looks wrong about a sweep is told by `ultragray check`.
     """
-    if Path(file).suffix == SCENE_SUFFIX:
+    if Path(file).suffix in (SCENE_SUFFIX, COMPRESSED_SUFFIX):
         if source != SourceOptions():
             raise InvalidArgument(f"options of sweeps are not for {file}, which is a scene file", field="source")
         document = describe_scene(Path(file))
@@ -121,10 +122,11 @@ def _describe_sweep(source: str, options: SourceOptions) -> dict[str, Any]:
     }
 
 
-EXCHANGED = (".ply", ".pt")
+EXCHANGED = (".ply", ".pt")  # what `import` reads
 
 
 @single(
+    "ultragray export liver.ugr -o liver.ugz  # a fifth of the bytes",
     "ultragray export liver.ugr -o liver.ply",
     "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own",
     "ultragray export liver.ugr --page liver-page && python -m http.server -d liver-page",
@@ -134,8 +136,8 @@ def export(
     output: Annotated[
         Path | None,
         output_option(
-            "A .ply file, which holds everything, or a .pt checkpoint of the released code, which gets conf.json "
-            "and poses_train.npy beside it: give it a folder of its own."
+            "A .ugz file, the scene compressed; a .ply file, which holds everything; or a .pt checkpoint of the "
+            "released code, which gets conf.json and poses_train.npy beside it: give it a folder of its own."
         ),
     ] = None,
     page: Annotated[
@@ -145,7 +147,7 @@ def export(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """`ultragray import` turns either file back into a scene file."""
+    """A .ugz file is a scene file itself; `ultragray import` turns the others back into one."""
     if (output is None) == (page is None):
         raise InvalidArgument("give either --output or --page", field="output")
     if page is not None:
@@ -157,15 +159,21 @@ def export(
         tell(words, {"files": [*map(str, files)], "bytes": size}, as_json=json)
         return
     assert output is not None
-    check_ending(output, EXCHANGED)
+    check_ending(output, (COMPRESSED_SUFFIX, *EXCHANGED))
     folder = output.absolute().parent
-    check_file(output if output.suffix == ".ply" or folder.exists() else folder, force=force)
+    check_file(output if output.suffix != ".pt" or folder.exists() else folder, force=force)
     read_header(scene)
 
     from ultragray import GaussianScene
 
     loaded = GaussianScene.load(scene)
     facts: dict[str, Any] = {"gaussian_count": loaded.gaussian_count, "files": [str(output)], "notes": []}
+    if output.suffix == COMPRESSED_SUFFIX:
+        loaded.save(output)
+        facts["bytes"] = output.stat().st_size
+        share = facts["bytes"] / scene.stat().st_size
+        tell(f"wrote {output}: {facts['bytes'] / 1e6:.2f} MB, {share:.0%} of {scene}", facts, as_json=json)
+        return
     if output.suffix == ".ply":
         from ultragray.exchange.ply import write_ply
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.errors import InvalidArgument
+from ultragray_workers.scene_names import SUFFIXES
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +33,7 @@ Json = Annotated[
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.", rich_help_panel=OUTPUT)]
 Threads = Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.", rich_help_panel=COMPUTE)]
 Backend = Annotated[str, typer.Option(help="auto, cpu, cuda or reference.", rich_help_panel=COMPUTE)]
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.ugr).", show_default=False)]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.ugr or .ugz).", show_default=False)]
 
 
 def command_group(help: str | None = None) -> typer.Typer:
@@ -115,7 +116,7 @@ def warn(text: str) -> None:
     typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
 
 
-SCENE_SUFFIX = ".ugr"  # the service lists no other files
+SCENE_SUFFIX, COMPRESSED_SUFFIX = SUFFIXES
 _TOLD_EVERY_S = 10.0
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 OR_A_FOLDER = ", or be a folder for PNGs (a name without an ending)"

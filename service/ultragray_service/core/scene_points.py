@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
-from ultragray.scene.info import LABELS_TENSOR, SceneInfo, scene_file_invalid
+from ultragray.scene.info import LABELS_TENSOR, SceneInfo, read_gaussians, scene_file_invalid
 
 FIELDS = ("x", "y", "z", "intensity", "transmittance", "deviation_mm")
 SHAPE_FIELDS = ("deviation_1_mm", "deviation_2_mm", "deviation_3_mm", "qw", "qx", "qy", "qz", "label")
@@ -52,24 +52,20 @@ def _columns(path: Path, info: SceneInfo, limit: int, wanted: set[str]) -> dict[
     chosen = even_selection(info.gaussian_count, limit)
     columns: dict[str, FloatArray] = {}
     try:
-        with safe_open(path, framework="numpy") as bundle:
-
-            def read(name: str) -> FloatArray:
-                return np.asarray(bundle.get_tensor(name)[chosen], np.float64)
-
-            means_mm = 10.0 * read("means") + np.asarray(info.centre_mm)
-            deviations_mm = 10.0 * np.exp(read("scales"))
-            columns.update(zip("xyz", means_mm.T, strict=True), deviation_mm=deviations_mm.mean(axis=1))
-            columns.update(zip(SHAPE_FIELDS[:3], deviations_mm.T, strict=True))
-            value = _SH_C0 * read("sh0")[:, 0, 0]
-            columns["transmittance"] = _sigmoid(read("transmittances"))
-            if not wanted.isdisjoint(SHAPE_FIELDS[3:7]):
-                quaternions = read("quats")
-                unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-                columns.update(zip(SHAPE_FIELDS[3:7], unit.T, strict=True))
-            if "label" in wanted:
-                columns["label"] = read(LABELS_TENSOR) if info.label_names else np.zeros(len(chosen))
-    except (OSError, SafetensorError, IndexError) as error:  # replaced since its header was read
+        gaussians = {name: values[chosen].astype(np.float64) for name, values in read_gaussians(path, info).items()}
+        means_mm = 10.0 * gaussians["means"] + np.asarray(info.centre_mm)
+        deviations_mm = 10.0 * np.exp(gaussians["scales"])
+        columns.update(zip("xyz", means_mm.T, strict=True), deviation_mm=deviations_mm.mean(axis=1))
+        columns.update(zip(SHAPE_FIELDS[:3], deviations_mm.T, strict=True))
+        value = _SH_C0 * gaussians["sh0"][:, 0, 0]
+        columns["transmittance"] = _sigmoid(gaussians["transmittances"])
+        if not wanted.isdisjoint(SHAPE_FIELDS[3:7]):
+            quaternions = gaussians["quats"]
+            unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+            columns.update(zip(SHAPE_FIELDS[3:7], unit.T, strict=True))
+        if "label" in wanted:
+            columns["label"] = gaussians[LABELS_TENSOR] if info.label_names else np.zeros(len(chosen))
+    except (OSError, SafetensorError, ValueError, IndexError) as error:  # replaced since its header was read
         raise scene_file_invalid(path, error) from error
     columns["intensity"] = _sigmoid(4.0 * value) if info.intensity == "sigmoid" else np.clip(value + 1.0, 0.5, 0.999)
     return columns

@@ -81,6 +81,7 @@ CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
 ASSETS_PATH = "/assets"
 PACKAGE_PATH = "/package"  # of @ultragray/web, by which a page renders frames itself
 _PAGE_NAME = "index.html"
+_EXPOSED = ("Retry-After", "ETag", "Content-Range")  # to pages of other origins
 _BESIDE = {"favicon.svg": "image/svg+xml", "licences.txt": "text/plain"}  # the page: file name and media type
 _HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
 _POLICY = (
@@ -269,7 +270,7 @@ def create_app(service: Service) -> FastAPI:
             allow_origins=list(service.settings.cors_origins),
             allow_methods=["GET", "POST", "PUT", "DELETE"],
             allow_headers=["*"],
-            expose_headers=["Retry-After", *{**rendering.RENDER_HEADERS, **rendering.SLICE_HEADERS}],
+            expose_headers=[*_EXPOSED, *{**rendering.RENDER_HEADERS, **rendering.SLICE_HEADERS}],
         )
     app.add_middleware(CheckOrigin, guard=service.guard, origins=service.origins)
     app.add_middleware(RequestContext, metrics=service.metrics)

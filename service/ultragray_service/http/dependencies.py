@@ -144,11 +144,15 @@ async def revalidated(
     request: Request, version: str, make: Callable[[], Awaitable[bytes]], media_type: str
 ) -> Response:
     """What `make` gives, with `version` (letters, digits, '-') as ETag; 304 where the client has that version."""
-    tag = f'"{version}"'
-    known = [known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(",")]
-    response = Response(status_code=304) if tag in known else Response(await make(), media_type=media_type)
-    response.headers.update({"ETag": tag, "Cache-Control": "private, no-cache"})
-    return response
+    headers = {"ETag": f'"{version}"', "Cache-Control": "private, no-cache"}
+    if is_known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(await make(), media_type=media_type, headers=headers)
+
+
+def is_known(request: Request, tag: str) -> bool:
+    """Whether the client has what the ETag names (If-None-Match)."""
+    return tag in (known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(","))
 
 
 DEMO_SCENE = "demo"

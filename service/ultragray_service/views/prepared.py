@@ -40,12 +40,14 @@ from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.views import (
+    COMPRESSED_NAME,
     FRAMES_NAME,
     PICTURES,
     POSES_NAME,
     PREVIEW_PICTURES,
     THUMBNAIL_NAME,
     compare,
+    compress_scene,
     draw_preview,
     draw_thumbnail,
     lay_out,
@@ -407,6 +409,23 @@ class Thumbnails(Prepared):
         path = await asyncio.to_thread(self._scenes.path, scene)
         folder = await self.path(key, scene_path=str(path))
         return await asyncio.to_thread((folder / THUMBNAIL_NAME).read_bytes)
+
+
+class CompressedScenes(Prepared):
+    """The compressed file of each scene, by the content of the scene."""
+
+    name, what, fill = "compressed", "compressing the scene", staticmethod(compress_scene)
+
+    def __init__(self, scenes: SceneStore, settings: Settings, processes: HelperProcesses) -> None:
+        super().__init__(settings, processes)
+        self._scenes = scenes
+
+    async def file(self, scene: str) -> Path:
+        """The scene's own file where that is compressed. Raises SceneNotFound, SceneFileInvalid, as `Prepared.path`."""
+        key = await in_own_thread(lambda: self._scenes.sha256(scene))
+        header = await in_own_thread(lambda: self._scenes.header(scene))
+        path = await asyncio.to_thread(self._scenes.path, scene)
+        return path if header.is_compressed else await self.path(key, scene_path=str(path)) / COMPRESSED_NAME
 
 
 _FORMAT = 4  # of what is kept of a comparison

@@ -3,12 +3,14 @@
 import ctypes
 import json
 import os
+import zlib
 from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+import torch
 
-from ultragray import GaussianScene
+from ultragray import GaussianScene, LinearProbe
 from ultragray.contract import from_dict
 from ultragray.errors import LowConfidence
 from ultragray.exchange.rendering import render_portions
@@ -21,6 +23,7 @@ from ultragray.rendering.settings import RenderSettings
 from ultragray.scene.confidence import Assessor, require_confidence
 
 IDENTITY = np.eye(4)
+PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 EXACT = [
     {},
     {"encoding": "float32", "outputs": ["bmode", "echo", "transmittance", "coverage", "attenuation"]},
@@ -107,6 +110,7 @@ def library():
     pointer, text, size = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t
     for name, result, arguments in (
         ("load", pointer, (text, size)),
+        ("load_part", pointer, (text, size)),
         ("scene_info", text, (pointer,)),
         ("free_scene", None, (pointer,)),
         ("prepare", pointer, (pointer, text)),
@@ -126,11 +130,11 @@ def library():
 
 
 class Scene:
-    """A scene that the library holds."""
+    """A scene that the library holds, of a whole file or of the beginning of one."""
 
-    def __init__(self, library, data):
+    def __init__(self, library, data, load="load"):
         self.library = library
-        self.pointer = library.ultragray_load(data, len(data))
+        self.pointer = getattr(library, f"ultragray_{load}")(data, len(data))
         assert self.pointer, self.problem
 
     @property
@@ -323,6 +327,87 @@ def test_poses_lead_into_tissue_that_followed_the_probe(library, following_scene
         np.testing.assert_array_equal(found, expected)
     rigid = Scene(library, following_scene.at_rest().to_bytes())
     assert not np.array_equal(rigid.render({"height": 80, "width": 90}, poses)[1], found.reshape(len(poses), -1))
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_compressed_scenes_are_read_as_python_reads_them(library, random_scene, tmp_path, sh_degree):
+    scene = random_scene(500, sh_degree=sh_degree, seed=sh_degree, intensity="sigmoid", info={"probe": PROBE})
+    scene.labels, scene.info = torch.arange(500).to(torch.uint8), replace(scene.info, label_names={1: "one"})
+    scene = scene if sh_degree else replace(scene, labels=None, info=replace(scene.info, label_names={}))
+    scene.save(tmp_path / "scene.ugz")
+    held, read = Scene(library, (tmp_path / "scene.ugz").read_bytes()), GaussianScene.load(tmp_path / "scene.ugz")
+    outputs = [*ALL, "labels"] if sh_degree else ALL
+    settings = {"encoding": "float32", "outputs": outputs, "height": 90, "width": 80}
+    for found, expected in both(held, read, settings, np.tile(IDENTITY, (1, 1, 1))):
+        assert expected.any()
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.fixture(scope="module")
+def compressed(python_scene):
+    """The demo scene, compressed, and where the parts of the file end."""
+    data = python_scene.to_compressed_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:begin])
+    ends = sorted(begin + one["data_offsets"][1] for name, one in header.items() if name.startswith("part."))
+    return data, ends
+
+
+def test_the_beginning_of_a_compressed_scene_is_a_coarser_scene(library, scene, python_scene, compressed):
+    data, ends = compressed
+    assert ends[-1] == len(data)
+    settings, poses = {"encoding": "float32", "height": 128, "width": 128}, poses_beside(python_scene, 3)
+    whole = scene.render(settings, poses)[1].view(np.float32)
+    errors = []
+    for end in ends:
+        for cut in (end, (end + ends[ends.index(end) + 1]) // 2 if end < ends[-1] else end):  # and what follows in half
+            part = Scene(library, data[:cut], "load_part").render(settings, poses)[1].view(np.float32)
+            errors.append(np.square(part - whole).mean())
+    assert errors[0:-1:2] == errors[1::2]
+    assert sorted(errors, reverse=True) == errors
+    assert errors[0] < np.square(whole - whole.mean()).mean()
+    assert errors[-1] < 2e-6
+    np.testing.assert_array_equal(Scene(library, data).render(settings, poses)[1].view(np.float32), part)
+
+
+def test_what_is_no_beginning_of_a_compressed_scene_is_one_sentence(library, compressed):
+    data, ends = compressed
+    for bytes_, problem in (
+        (data[:3000], "it is cut off: its header tells of more"),
+        (data[:20_000], "it is cut off: its header tells of more"),
+        (data[: ends[0] - 1], "it is cut off: its header tells of more"),
+        (DEMO_FILE.read_bytes()[:100_000], "only compressed scene files (.ugz) can be read in parts"),
+    ):
+        assert not library.ultragray_load_part(bytes_, len(bytes_))
+        assert library.ultragray_problem().decode() == problem
+    assert not library.ultragray_load(data, ends[0])
+    assert library.ultragray_problem().decode() == "it is cut off: its header tells of more"
+
+
+def test_hostile_parts_are_one_sentence(library, compressed):
+    """Of the same size and with the right checksum, but other bytes: refused, or read; never a crash."""
+    data, ends = compressed
+    begin = data.index(data[ends[-2] : ends[-2] + 64])
+    random = np.random.default_rng(6)
+    problems = set()
+    for turn in range(300):
+        part = bytearray(data[begin:])
+        span = 300 if turn % 2 else len(part) - 4  # head and table, or anywhere
+        for place in random.integers(0, span, size=random.integers(1, 4)):
+            part[place] = random.integers(0, 256)
+        if turn % 3:
+            part[-4:] = zlib.crc32(part[:-4]).to_bytes(4, "little")
+        one = data[:begin] + bytes(part)
+        pointer = library.ultragray_load(one, len(one))
+        if pointer:
+            library.ultragray_free_scene(pointer)
+        else:
+            problems.add(library.ultragray_problem().decode())
+    assert {
+        "its part.03 is damaged: its checksum differs",
+        "its part.03 has a head that it cannot have",
+        "its part.03 is not of the size that its head says",
+    } <= problems
 
 
 def test_a_view_outlives_its_scene(library, python_scene):

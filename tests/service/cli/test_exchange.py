@@ -40,6 +40,17 @@ def test_a_ply_and_back_is_the_same_file(make_file, tmp_path):
     assert (tmp_path / "b.ugr").read_bytes() == scene.read_bytes()
 
 
+def test_a_compressed_scene_is_a_scene_file_itself(make_file, tmp_path):
+    scene, small = make_file(), tmp_path / "small.ugz"
+    result = run("export", scene, "-o", small)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert f"{small.stat().st_size / 1e6:.2f} MB" in result.stdout
+    assert small.read_bytes() == GaussianScene.load(scene).to_compressed_bytes()
+    assert json.loads(run("show", small, "--json").stdout)["gaussian_count"] == 60
+    assert run("render", small, "-o", tmp_path / "frames.npz").exit_code == 0
+    assert run("export", small, "-o", tmp_path / "a.ply").exit_code == 0
+
+
 def test_a_checkpoint_and_back_by_the_documented_commands(make_file, tmp_path):
     folder = tmp_path / "released"
     result = run("export", make_file(), "-o", folder / "ckpt_0.pt")

@@ -62,6 +62,8 @@ def test_a_scene_goes_down_and_up_again(server, scene, tmp_path):
     assert "demo.ugr exists: --force" in refused(server, "scenes", "download", scene, "-o", tmp_path / "demo.ugr")
     assert "there is no scene 'none'" in refused(server, "scenes", "download", "none", "-o", tmp_path / "none.ugr")
     assert not (tmp_path / "none.ugr").exists()
+    done(server, "scenes", "download", scene, "-o", tmp_path / "demo.ugz")
+    assert read_header(tmp_path / "demo.ugz").is_compressed
 
 
 def test_a_frame_as_a_picture(server, tmp_path):

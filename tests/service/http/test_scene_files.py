@@ -1,5 +1,6 @@
 """Scene files over HTTP: looked into, downloaded, imported, deleted."""
 
+import hashlib
 import json
 import socket
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
-from ultragray import GaussianScene
+from ultragray import GaussianScene, read_header
 from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until
@@ -238,3 +239,44 @@ def test_corrected_training_poses(http):
     told = http.get("/v1/scenes/corrected/training-poses").json()
     assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
     http.delete("/v1/scenes/corrected")
+
+
+def test_a_scene_is_handed_out_compressed_once_made(http, demo_scene, artifacts, tmp_path):
+    answer = http.get("/v1/scenes/demo/file.ugz")
+    assert answer.status_code == 200, answer.text
+    assert 'filename="demo.ugz"' in answer.headers["content-disposition"]
+    assert answer.headers["accept-ranges"] == "bytes"
+    (tmp_path / "got.ugz").write_bytes(answer.content)
+    assert read_header(tmp_path / "got.ugz").is_compressed
+    assert answer.content == demo_scene.to_compressed_bytes()
+    (kept,) = (artifacts / "compressed").glob("*/*.ugz")
+    made = kept.stat().st_mtime_ns
+    tag = answer.headers["etag"]
+    assert tag == f'"{hashlib.sha256(answer.content).hexdigest()}"'
+    assert http.get("/v1/scenes/demo/file.ugz", headers={"If-None-Match": tag}).status_code == 304
+    part = {"Range": "bytes=1000-"}
+    rest = http.get("/v1/scenes/demo/file.ugz", headers={**part, "If-Range": tag})
+    assert (rest.status_code, rest.content) == (206, answer.content[1000:])
+    assert rest.headers["content-range"] == f"bytes 1000-{len(answer.content) - 1}/{len(answer.content)}"
+    assert http.get("/v1/scenes/demo/file.ugz", headers={**part, "If-Range": '"another"'}).status_code == 200
+    assert http.get("/v1/scenes/demo/file.ugz", headers={"Range": "bytes=100000000-"}).status_code == 416
+    assert kept.stat().st_mtime_ns == made
+    assert http.get("/v1/scenes/nobody/file.ugz").json()["reason"] == "SCENE_NOT_FOUND"
+
+
+def test_a_compressed_scene_is_served_like_any_other(http, demo_scene):
+    sent = demo_scene.to_compressed_bytes()
+    answer = http.put("/v1/scenes/small", content=sent, headers=RAW)
+    assert answer.status_code == 201, answer.text
+    try:
+        for form in ("file", "file.ugz"):
+            whole = http.get(f"/v1/scenes/small/{form}")
+            assert whole.content == sent
+            assert 'filename="small.ugz"' in whole.headers["content-disposition"]
+        assert http.post("/v1/scenes/small/render", json={"pose": POSE}).status_code == 200
+        _, points = points_of(http.get("/v1/scenes/small/gaussians"))
+        assert len(points) == demo_scene.gaussian_count
+        cut = http.put("/v1/scenes/cut", content=sent[:-100], headers=RAW).json()
+        assert (cut["reason"], cut["field"]) == ("SCENE_FILE_INVALID", "body")
+    finally:
+        assert http.delete("/v1/scenes/small").status_code == 204

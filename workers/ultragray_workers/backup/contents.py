@@ -13,8 +13,9 @@ from pathlib import Path, PurePosixPath
 from ultragray.files import file_sha256, sync
 from ultragray_workers.datasets.store import FILES, MANIFESTS
 from ultragray_workers.jobs.files import FOLDER as JOBS
+from ultragray_workers.scene_names import SUFFIXES
 from ultragray_workers.scene_shelf import SCENES_FOLDER
-from ultragray_workers.scenes import SUFFIX, SceneStore
+from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.local import FileVersion
 from ultragray_workers.store import MARKER
 
@@ -62,12 +63,11 @@ def files_of(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
 
 
 def _files(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
-    for name in SceneStore(folders.data).names():
-        yield StoredFile(DATA, PurePosixPath(f"{name}{SUFFIX}"), folders.data / f"{name}{SUFFIX}")
     artifacts = folders.artifacts
-    for name in SceneStore(artifacts / SCENES_FOLDER).names():
-        path = PurePosixPath(SCENES_FOLDER, f"{name}{SUFFIX}")
-        yield StoredFile(ARTIFACTS, path, artifacts / path)
+    for root, below in ((DATA, PurePosixPath()), (ARTIFACTS, PurePosixPath(SCENES_FOLDER))):
+        scenes = folders.root(root) / below
+        names = [f"{name}{suffix}" for name in SceneStore(scenes).names() for suffix in SUFFIXES]
+        yield from (StoredFile(root, below / name, scenes / name) for name in names if (scenes / name).is_file())
     for folder in (FILES, MANIFESTS, JOBS):  # a dataset's files are there before its manifest
         kept = _below(artifacts, PurePosixPath(folder))
         yield from (file for file in kept if not any(map(_is_of_a_process, file.path.parts[1:])))

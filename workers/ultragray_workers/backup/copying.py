@@ -19,7 +19,7 @@ from ultragray_workers.storage.storage import NotThere, Storage
 
 ARTIFACTS = "artifacts"  # the artifact folder, below a data folder
 _SCENES = re.compile(
-    rf"({ARTIFACTS}/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ugr|({ARTIFACTS}/)?scenes/[^./][^/]*\.json"
+    rf"({ARTIFACTS}/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ug[rz]|({ARTIFACTS}/)?scenes/[^./][^/]*\.json"
 )
 
 

@@ -24,7 +24,7 @@ from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import WORKERS
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIXES
 from ultragray_workers.store import (
     PRIVATE_FILE,
     PRIVATE_FOLDER,
@@ -106,7 +106,7 @@ def _require_room(manifest: Manifest, folders: Folders) -> None:
 
 def _require_empty(folders: Folders, database: Database) -> None:
     for file in files_of(folders, database.sqlite):
-        if "/" in str(file.path) or file.path.suffix == SUFFIX:
+        if "/" in str(file.path) or file.path.suffix in SUFFIXES:
             raise RestoreRefused(
                 f"{folders.root(file.root)} holds something already, such as {file.path}: name empty folders, or give "
                 "--force to replace all that is there"
@@ -139,7 +139,7 @@ def _write_files(manifest: Manifest, folders: Folders, objects: Objects) -> None
                 with atomic_path(target) as temporary:
                     shutil.copyfile(objects.path(entry.sha256), temporary)
                 os.utime(target, ns=(entry.mtime_ns, entry.mtime_ns))
-        if target.suffix == SUFFIX and entry.root == ARTIFACTS:
+        if target.suffix in SUFFIXES and entry.root == ARTIFACTS:
             scenes.setdefault(entry.sha256, target)
         written.add(target.parent)
     for folder in written:

@@ -16,6 +16,7 @@ from starlette.responses import FileResponse, Response
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument
+from ultragray.files import file_sha256
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.scene.info import SceneHeader
@@ -54,13 +55,14 @@ from ultragray_service.http.dependencies import (
     blocks_of,
     check_upload,
     finish_or_abandon,
+    is_known,
     problems,
     revalidated,
 )
 from ultragray_service.http.routes.datasets import Private
 from ultragray_service.views.poses import Assessments, Located, locate, sought_frame
 from ultragray_workers.jobs.owners import Kind
-from ultragray_workers.scene_names import SUFFIX, base_name
+from ultragray_workers.scene_names import SUFFIXES, base_name
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -222,9 +224,27 @@ async def get_thumbnail(request: Request, service: ServiceDep, scene: SceneName)
 @router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
-    await service.catalog.header(scene)
+    header = await service.catalog.header(scene)
     path = await asyncio.to_thread(service.scene_store.path, scene)
-    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
+    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIXES[header.is_compressed]}")
+
+
+@router.get(
+    "/{scene}/file.ugz",
+    response_class=FileResponse,
+    responses=_FILE | NOT_MODIFIED | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def download_compressed_scene(request: Request, service: ServiceDep, scene: SceneName) -> Response:
+    """Downloads the scene, compressed: about a fifth of the bytes, coarse first. Ranges are answered.
+
+    It is made at the first request.
+    """
+    service.life.require_serving()
+    path = await service.compressed.file(scene)
+    headers = {"ETag": f'"{await asyncio.to_thread(file_sha256, path)}"', "Cache-Control": "private, no-cache"}
+    if is_known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIXES[True]}", headers=headers)
 
 
 @router.put(
