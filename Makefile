@@ -11,8 +11,8 @@ KERNEL_SOURCES := $(wildcard model/kernels/* model/library/*) CMakeLists.txt
 PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py tests/model/library/test_generated.py
-PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py tests/model/library/test_generated.py tests/engines/test_generated.py
+PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples engines
 CPP_SOURCES := $(wildcard model/kernels/*.[ch]pp model/kernels/*.inl model/library/*.[ch]pp)
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -241,10 +241,11 @@ demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene fro
 docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
 	$(BIN)/python -m docs.generator
 
-generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract, the client's part of it, that of libultragray, snapshots, the console's types
+generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract, the client's part of it, those of libultragray and C#, snapshots, the console's types
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
 	$(BIN)/python model/library/generate.py
+	$(BIN)/python engines/generate.py
 	$(BIN)/python -m docs.generator.snapshots
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent generate
 

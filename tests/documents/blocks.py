@@ -9,7 +9,7 @@ from markdown_it import MarkdownIt
 
 SHELL = {"console", "bash"}
 PARSED = {"json", "toml", "yaml"}
-INERT = {"text", "html", "javascript", "ini", "proto", "xml", "c", "http"}
+INERT = {"text", "html", "javascript", "ini", "proto", "xml", "c", "csharp", "cmake", "http"}
 LANGUAGES = {*SHELL, "python", *PARSED, *INERT}
 
 _STEERING = re.compile(r"^<!-- (needs|not run|serves)(?:: (.*?))? -->$", flags=re.MULTILINE)
