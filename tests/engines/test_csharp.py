@@ -14,12 +14,11 @@ from ultragray.contract import from_dict, to_dict
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import Probe
 from ultragray.phantom.demo import DEMO_FILE
-from ultragray.rendering.frames import render_shown
-from ultragray.rendering.pixels import in_type
 from ultragray.rendering.settings import RenderSettings
 from ultragray.rendering.tools import Tool
 
 from ..client.proxy import Proxy
+from ..model.library.test_library import of_python
 
 KEY = "0123456789abcdef-engines"
 
@@ -233,16 +232,13 @@ def test_local_frames_are_those_of_python_byte_for_byte(driver, start, settings,
     turned = (0.9, 0.1, -0.3, 0.2)
     unit = (np.array(turned) / np.linalg.norm(turned)).tolist()
     program.say("ask", 3, -4, 1, *unit)
-    height, width, _, sum_ = program.wait_for("frame", 1).split()
+    height, width, confidence, sum_ = program.wait_for("frame", 1).split()
     program.end()
-    scene = GaussianScene.load(DEMO_FILE)
-    asked = from_dict(RenderSettings, settings)
-    resolved = asked.resolved(scene.info, asked.encoding)
-    shown = render_shown(scene, resolved, pose_from_position_quaternion((3, -4, 1), unit)[None])
-    types = {name: np.uint8 if name == "labels" else asked.encoding.pixel_type for name in resolved.outputs}
-    expected = b"".join(in_type(shown[name].numpy(), types[name]).tobytes() for name in resolved.outputs)
-    assert (int(height), int(width)) == (resolved.picture.height, resolved.picture.width)
-    assert sum_ == sha256(expected)
+    pose = pose_from_position_quaternion((3, -4, 1), unit)
+    shown, (extrapolation,) = of_python(GaussianScene.load(DEMO_FILE), settings, pose[None])
+    assert sum_ == sha256(b"".join(one.tobytes() for one in shown.values()))
+    assert (1, int(height), int(width)) == next(iter(shown.values())).shape
+    assert float(confidence) == pytest.approx(extrapolation.confidence)
 
 
 def test_what_is_wrong_with_local_frames_is_told_in_a_sentence(driver, start, tmp_path):
