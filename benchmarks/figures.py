@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ablations
+import compressed
 import confidence
 import hand
 import localization
@@ -50,6 +51,7 @@ TARGETS = {
         name: name
         for name in ("ablations", "poses", "hand", "localization", "confidence", "speckle", "environment", "ros")
     },
+    "compressed": "compressed",
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
@@ -344,6 +346,7 @@ BLOCKS = {
     "poses": Block("poses", poses.refined_poses),
     "hand": Block("hand", hand.predicted, hand.of_paths),
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
+    "compressed": Block("compressed", compressed.kept),
     "localization": Block("localization", localization.found_frames),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
     "speckle": Block("speckle", speckle.textures),

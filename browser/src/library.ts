@@ -6,6 +6,7 @@ interface Exports {
   malloc(bytes: number): number;
   free(at: number): void;
   ultragray_load(bytes: number, size: number): number;
+  ultragray_load_part(bytes: number, size: number): number;
   ultragray_scene_info(scene: number): number;
   ultragray_free_scene(scene: number): void;
   ultragray_prepare(scene: number, settings: number): number;
@@ -15,6 +16,9 @@ interface Exports {
   ultragray_render(view: number, poses: number, count: number, threads: number, pixels: number, extrapolations: number): number;
   ultragray_problem(): number;
 }
+
+/** How much of a file is at hand. */
+export type Extent = "whole" | "beginning";
 
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
 const POSE_BYTES = 128;
@@ -37,9 +41,10 @@ export class Library {
     return library;
   }
 
-  /** A scene of the bytes of a scene file, and what it says of itself. */
-  load(bytes: Uint8Array): { scene: number; info: string } {
-    const scene = this.#with(bytes, (at) => this.exports.ultragray_load(at, bytes.length));
+  /** A scene of the bytes of a scene file, or of the beginning of a compressed one, and what it says of itself. */
+  load(bytes: Uint8Array, extent: Extent): { scene: number; info: string } {
+    const read = extent === "whole" ? this.exports.ultragray_load : this.exports.ultragray_load_part;
+    const scene = this.#with(bytes, (at) => read(at, bytes.length));
     if (scene === 0) this.#fail();
     return { scene, info: this.#text(this.exports.ultragray_scene_info(scene)) };
   }

@@ -40,4 +40,4 @@ probe.addEventListener("frame", (event) => {
 probe.addEventListener("problem", (event) => (status.value = (event as CustomEvent<Error>).detail.message));
 take();
 probe.pose = page.poses[Number(sweep.value)]!;
-probe.setAttribute("src", "scene.ugr");
+probe.setAttribute("src", "scene.ugz");

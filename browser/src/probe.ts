@@ -2,7 +2,8 @@
  *
  * Attributes: `src`, the address of a scene file that is rendered here, or `service` and `scene` of one that a service
  * renders; `pose`, 16 numbers; `settings`, JSON. Properties of the same names (a pose as numbers, settings as an object).
- * Events: `frame` (detail: the Frame and its pose), `problem` (detail: an Error).
+ * Events: `frame` (detail: the Frame and its pose), `progress` (detail: the share of the file that frames show, while a
+ * compressed one arrives), `problem` (detail: an Error).
  */
 
 import { IDENTITY, type Pose } from "./pose.js";
@@ -109,10 +110,21 @@ export class UltragrayProbe extends HTMLElement {
   #open(): void {
     this.#close();
     const [src, service, name] = ["src", "service", "scene"].map((attribute) => this.getAttribute(attribute));
-    if (src) this.#scene = Scene.load(new URL(src, document.baseURI));
+    if (src) this.#scene = this.#load(new URL(src, document.baseURI));
     else if (service && name) this.#scene = Scene.connect(service, name);
     else return;
     this.#draw();
+  }
+
+  /** A scene whose image is drawn anew with all that arrives. */
+  async #load(address: URL): Promise<Scene> {
+    const progress = (share: number): void => {
+      this.#draw();
+      this.dispatchEvent(new CustomEvent("progress", { detail: share }));
+    };
+    const scene = await Scene.load(address, { progress });
+    scene.whole.catch((error: Error) => this.dispatchEvent(new CustomEvent("problem", { detail: error })));
+    return scene;
   }
 
   /** Draws the newest pose, and after it none that was overtaken. */

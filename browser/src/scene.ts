@@ -2,6 +2,8 @@
 
 import type { components } from "./generated/openapi.js";
 import type { Pose } from "./pose.js";
+import { Arrival } from "./arrival.js";
+import type { Extent } from "./library.js";
 import type { Answer, Request } from "./worker.js";
 
 type Schemas = components["schemas"];
@@ -71,6 +73,8 @@ export class Frame {
 export interface Scene {
   /** What the scene says of itself: probe, size of its images, labels … */
   readonly info: SceneInfo;
+  /** When frames are those of the whole file. Rejects, in a sentence, where the rest of it is damaged, or does not come. */
+  readonly whole: Promise<void>;
   /** The frame of a pose. Throws, in a sentence, for a pose or settings that cannot be. */
   render(pose: Pose, settings?: Settings): Promise<Frame>;
   close(): void;
@@ -88,6 +92,7 @@ export interface SceneInfo {
 const MOST_VIEWS = 4; // settings that are kept ready
 
 class LocalScene implements Scene {
+  readonly whole = Promise.resolve();
   #views = new Map<string, Promise<{ view: number; info: FrameInfo }>>();
 
   constructor(
@@ -161,9 +166,56 @@ class Renderer {
   }
 }
 
+/** A scene whose file still arrives: finer ones of the same take its place. */
+class ArrivingScene implements Scene {
+  readonly whole: Promise<void>;
+  #closed = false;
+
+  constructor(
+    private now: Scene,
+    arrival: Arrival,
+    progress: (share: number) => void,
+  ) {
+    this.whole = this.#refine(arrival, progress);
+    this.whole.catch(() => undefined); // for those who do not ask for it
+  }
+
+  get info(): SceneInfo {
+    return this.now.info;
+  }
+
+  async render(pose: Pose, settings?: Settings): Promise<Frame> {
+    const used = this.now;
+    try {
+      return await used.render(pose, settings);
+    } catch (error) {
+      if (used === this.now) throw error;
+      return this.render(pose, settings); // a finer one has taken its place
+    }
+  }
+
+  close(): void {
+    this.#closed = true;
+    this.now.close();
+  }
+
+  async #refine(arrival: Arrival, progress: (share: number) => void): Promise<void> {
+    progress(arrival.share);
+    while (await arrival.more()) {
+      const finer = await opened(...arrival.take());
+      if (this.#closed) return finer.close();
+      const coarser = this.now;
+      this.now = finer;
+      coarser.close();
+      progress(arrival.share);
+    }
+  }
+}
+
 type Waiting = { resolve: (frame: Frame) => void; reject: (error: Error) => void };
 
 class ServedScene implements Scene {
+  readonly whole = Promise.resolve();
   #socket: Promise<WebSocket> | undefined;
   #sequence = 0;
   #waiting = new Map<number, Waiting>();
@@ -236,27 +288,33 @@ function checked(pose: Pose): number[] {
   return [...pose];
 }
 
-async function bytesOf(source: string | URL | Uint8Array): Promise<Uint8Array> {
-  if (source instanceof Uint8Array) return source;
-  const answer = await fetch(source);
-  if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
-  return new Uint8Array(await answer.arrayBuffer());
+async function opened(bytes: Uint8Array, extent: Extent): Promise<Scene> {
+  const renderer = new Renderer();
+  try {
+    const { scene, info } = await renderer.ask<{ scene: number; info: string }>({ act: "load", bytes, extent });
+    const told = JSON.parse(info) as SceneInfo;
+    told.label_names ??= {}; // a file without labels says nothing of them
+    return new LocalScene(renderer, scene, told);
+  } catch (error) {
+    renderer.close();
+    throw error;
+  }
 }
 
 export const Scene = {
-  /** A scene file, of an address or of its bytes, whose frames are rendered here. Throws, in a sentence, for what is none. */
-  async load(source: string | URL | Uint8Array): Promise<Scene> {
-    const bytes = await bytesOf(source);
-    const renderer = new Renderer();
-    try {
-      const { scene, info } = await renderer.ask<{ scene: number; info: string }>({ act: "load", bytes });
-      const told = JSON.parse(info) as SceneInfo;
-      told.label_names ??= {}; // a file without labels says nothing of them
-      return new LocalScene(renderer, scene, told);
-    } catch (error) {
-      renderer.close();
-      throw error;
-    }
+  /** A scene file, of an address or of its bytes, whose frames are rendered here. Throws, in a sentence, for what is none.
+   *
+   * A compressed file (.ugz) is a scene as soon as its first part is there, and becomes finer as the others arrive:
+   * `progress` is then called with the share of the file that frames show.
+   */
+  async load(source: string | URL | Uint8Array, { progress = () => undefined }: { progress?: (share: number) => void } = {}): Promise<Scene> {
+    if (source instanceof Uint8Array) return opened(source, "whole");
+    const answer = await fetch(source);
+    if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
+    const arrival = new Arrival(answer.body!);
+    await arrival.more();
+    const scene = await opened(...arrival.take());
+    return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress) : scene;
   },
 
   /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed. */

@@ -1,9 +1,9 @@
 /** Renders in a thread of its own, so that the page never waits. It answers each request with its number. */
 
-import { Library } from "./library.js";
+import { Library, type Extent } from "./library.js";
 
 export type Request =
-  | { act: "load"; bytes: Uint8Array }
+  | { act: "load"; bytes: Uint8Array; extent: Extent }
   | { act: "prepare"; scene: number; settings: string }
   | { act: "render"; view: number; pose: readonly number[] }
   | { act: "freeView"; view: number };
@@ -22,7 +22,7 @@ async function done(request: Request, transfer: Transferable[]): Promise<unknown
   const opened = await library;
   switch (request.act) {
     case "load":
-      return opened.load(request.bytes);
+      return opened.load(request.bytes, request.extent);
     case "prepare":
       return opened.prepare(request.scene, request.settings);
     case "render": {

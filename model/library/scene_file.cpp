@@ -260,8 +260,12 @@ Scene Scene::read(const void* bytes, size_t size, Extent extent) {
     Parameters all =
         bundle.is_compressed() ? bundle.parts(whole, terms, has_labels) : bundle.whole(whole, terms, has_labels);
     const int64_t n = int64_t(all.sh0.size());
-    if (n < whole)  // where the small ones have not come, the large ones fill their place: a measured power of the share
+    if (n < whole) {  // where the small ones have not come, the large ones fill their place: a measured power
         for (float& scale : all.scales) scale += float(std::log(double(whole) / double(n)) / 8.0);
+        Json document = Json::parse(info.json);
+        document["gaussian_count"] = info.gaussian_count = n;
+        info.json = document.dump();
+    }
     check_values("means", all.means, n, kMostMean);
     check_values("scales", all.scales, n, kMostLogScale);
     check_values("quats", all.quats, n, kMostOther);

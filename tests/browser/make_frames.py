@@ -1,7 +1,8 @@
 """Writes a page of the demo scene and random frames of it as the reference renders them.
 
-`make_frames.py FOLDER COUNT SEED`: beside the page, requests.json (pose and settings of each, and by how much its
-display settings enlarge a difference) and expected.bin, the float32 of all, one after another.
+`make_frames.py FOLDER COUNT SEED`: beside the page, demo.ugr, its scene before that was compressed, requests.json (pose
+and settings of each, and by how much its display settings enlarge a difference) and expected.bin, the float32 of all,
+one after another.
 """
 
 import json
@@ -15,7 +16,7 @@ from ultragray.contract import from_dict, to_dict
 from ultragray.exchange.page import write_page
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.rotations import random_directions, rotations_of
-from ultragray.phantom.demo import DEMO_FILE
+from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene
 from ultragray.rendering.display import FRAME_RANGE_DB
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import RenderSettings
@@ -62,7 +63,8 @@ def random_probe(random):
 def main(folder, count, seed):
     random = np.random.default_rng(seed)
     write_page(DEMO_FILE, folder)
-    scene = GaussianScene.load(DEMO_FILE)
+    copy_demo_scene(folder / "demo.ugr")
+    scene = GaussianScene.load(folder / "scene.ugz")
     requests = []
     with (folder / "expected.bin").open("wb") as expected:
         for _ in range(count):

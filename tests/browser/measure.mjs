@@ -29,7 +29,8 @@ const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1]
 /** Milliseconds of each frame along the sweep, one after another. */
 async function rendered_ms({ side, frames }) {
   const { poses } = await (await fetch("page.json")).json();
-  globalThis.scene ??= await (await import("./index.js")).Scene.load("scene.ugr");
+  globalThis.scene ??= await (await import("./index.js")).Scene.load("scene.ugz");
+  await globalThis.scene.whole;
   const found = [];
   for (let k = -5; k < frames; k++) {
     const before = performance.now();

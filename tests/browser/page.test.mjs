@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { execFileSync, spawn } from "node:child_process";
 import { once } from "node:events";
+import http from "node:http";
 import { mkdtempSync, readFileSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import path from "node:path";
@@ -45,7 +46,8 @@ async function differences(MOST) {
     fetch("requests.json").then((answer) => answer.json()),
     fetch("expected.bin").then((answer) => answer.arrayBuffer()),
   ]);
-  const scene = await Scene.load("scene.ugr");
+  const scene = await Scene.load("scene.ugz");
+  await scene.whole;
   let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
   for (const { pose, settings, enlarged } of requests) {
     const frame = await scene.render(pose, settings);
@@ -148,7 +150,7 @@ test("what is wrong is said in a sentence", async () => {
   const problems = await page.evaluate(async () => {
     const { Scene } = await import("./index.js");
     const told = (act) => act().then(() => "nothing", (error) => error.message);
-    const bytes = new Uint8Array(await (await fetch("scene.ugr")).arrayBuffer());
+    const bytes = new Uint8Array(await (await fetch("demo.ugr")).arrayBuffer());
     const scene = await Scene.load(bytes);
     const pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
     return [
@@ -165,6 +167,105 @@ test("what is wrong is said in a sentence", async () => {
   await page.close();
 });
 
+/** Hands out the site, and of slow.ugz its beginning at once, the rest after a request for /rest; cut.ugz and damaged.ugz are what they are called. */
+async function slowServer() {
+  const whole = readFileSync(path.join(site, "scene.ugz"));
+  const damaged = Buffer.from(whole);
+  damaged[whole.length - 100] ^= 1;
+  const beginning = Math.floor(whole.length / 2); // within the third of four parts
+  let hold;
+  const types = { html: "text/html", css: "text/css", js: "text/javascript", json: "application/json", wasm: "application/wasm" };
+  const slow = http.createServer((request, response) => {
+    const name = request.url.slice(1) || "index.html";
+    if (name === "rest") hold?.end(whole.subarray(beginning));
+    if (name === "slow.ugz") (hold = response).writeHead(200).write(whole.subarray(0, beginning));
+    else if (name === "cut.ugz") response.end(whole.subarray(0, beginning));
+    else if (name === "damaged.ugz") response.end(damaged);
+    else response.writeHead(200, { "Content-Type": types[name.split(".").at(-1)] ?? "text/plain" }).end(name === "rest" ? "" : readFileSync(path.join(site, name)));
+  });
+  slow.listen(0, "127.0.0.1");
+  await once(slow, "listening");
+  return slow;
+}
+
+test("a compressed scene is rendered while it arrives, coarse first", async () => {
+  const slow = await slowServer();
+  const page = await browser.newPage();
+  try {
+    await page.goto(`http://127.0.0.1:${slow.address().port}/`);
+    const { shares, apart, same, before, after, cut, damaged } = await page.evaluate(async () => {
+      const { Scene } = await import("./index.js");
+      const { poses } = await (await fetch("page.json")).json();
+      const pose = poses[poses.length >> 1];
+      const size = { height: 128, width: 128 };
+      const pixels = async (scene) => [...(await scene.render(pose, size)).pixels()];
+      const rms = (one, other) => Math.sqrt(one.reduce((sum, value, at) => sum + (value - other[at]) ** 2, 0) / one.length);
+      const whole = await pixels(await Scene.load(new Uint8Array(await (await fetch("scene.ugz")).arrayBuffer())));
+      const shares = [];
+      const scene = await Scene.load("slow.ugz", { progress: (share) => shares.push(share) });
+      const coarse = await pixels(scene);
+      const before = scene.info.gaussian_count;
+      await fetch("rest");
+      await scene.whole;
+      const fine = await pixels(scene);
+      const told = async (address) => {
+        const scene = await Scene.load(address);
+        const problem = await scene.whole.then(() => "nothing", (error) => error.message);
+        return [problem, (await pixels(scene)).length];
+      };
+      const [cut, damaged] = [await told("cut.ugz"), await told("damaged.ugz")];
+      const apart = [rms(coarse, whole), rms(whole, whole.map(() => 0))];
+      return { shares, apart, same: rms(fine, whole), before, after: scene.info.gaussian_count, cut, damaged };
+    });
+    assert.ok(shares.length >= 2 && shares[0] > 0 && shares[0] < 0.5 && shares.at(-1) === 1, `shares ${shares}`);
+    assert.ok(apart[0] > 0 && apart[0] < 0.8 * apart[1], `${apart}`);
+    assert.equal(same, 0);
+    assert.ok(before < after, `${before} of ${after} Gaussians`);
+    assert.match(cut[0], /cut off/);
+    assert.match(damaged[0], /part\.03 is damaged: its checksum differs/);
+    assert.deepEqual([cut[1], damaged[1]], [128 * 128, 128 * 128]);
+    const drawn = page.evaluate(async () => {
+      const probe = document.querySelector("ultragray-probe");
+      const seen = [];
+      const next = (name) => new Promise((resolve) => probe.addEventListener(name, ({ detail }) => resolve(detail), { once: true }));
+      const frame = next("frame");
+      probe.setAttribute("src", "slow.ugz");
+      seen.push((await frame).frame.pixels().reduce((sum, value) => sum + value, 0));
+      const progress = next("progress");
+      await fetch("rest");
+      while ((await progress) < 1 && (await next("progress")) < 1);
+      seen.push((await next("frame")).frame.pixels().reduce((sum, value) => sum + value, 0));
+      return seen;
+    });
+    const [first, last] = await drawn;
+    assert.notEqual(first, last);
+  } finally {
+    await page.close();
+    slow.closeAllConnections();
+    slow.close();
+  }
+});
+
+test("a page of an allowed site loads the scene of a service, compressed", async () => {
+  const service = await Service.start({ ULTRAGRAY_CORS_ORIGINS: new URL(url).origin });
+  const context = await browser.newContext({ bypassCSP: true }); // the exported page allows itself alone
+  try {
+    const page = await context.newPage();
+    await page.goto(url);
+    const [count, tag] = await page.evaluate(async (address) => {
+      const { Scene } = await import("./index.js");
+      const scene = await Scene.load(address);
+      await scene.whole;
+      return [scene.info.gaussian_count, (await fetch(address)).headers.get("ETag")];
+    }, `${service.url}/v1/scenes/demo/file.ugz`);
+    assert.equal(count, 50_000);
+    assert.match(tag, /^"[0-9a-f]{64}"$/);
+  } finally {
+    await context.close();
+    await service.stop();
+  }
+});
+
 test("a scene of a service is rendered behind the same interface", async () => {
   const service = await Service.start();
   const context = await browser.newContext();
@@ -179,7 +280,7 @@ test("a scene of a service is rendered behind the same interface", async () => {
     await page.goto(`${service.url}/healthz`);
     const apart = await page.evaluate(async () => {
       const { Scene } = await import("/package/index.js");
-      const [local, served] = await Promise.all([Scene.load("/package/scene.ugr"), Scene.connect(location.origin, "demo")]);
+      const [local, served] = await Promise.all([Scene.load("/package/demo.ugr"), Scene.connect(location.origin, "demo")]);
       const { poses } = await (await fetch("/package/page.json")).json();
       const drawn = { gain_db_between: [-5, 5], dynamic_range_db_between: [45, 70] };
       const settings = { height: 64, width: 80, display: drawn, contact: "pressure", speckle: "natural" };

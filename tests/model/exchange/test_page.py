@@ -24,8 +24,11 @@ def built(tmp_path, monkeypatch):
 
 def test_a_page_holds_renderer_scene_and_poses(built):
     files = page.write_page(DEMO_FILE, built / "made" / "page")
-    assert [path.name for path in files] == ["index.html", "page.json", "scene.ugr", "ultragray.wasm"]
-    assert (built / "made" / "page" / "scene.ugr").read_bytes() == DEMO_FILE.read_bytes()
+    assert [path.name for path in files] == ["index.html", "page.json", "scene.ugz", "ultragray.wasm"]
+    scene = built / "made" / "page" / "scene.ugz"
+    assert read_header(scene).is_compressed
+    page.write_page(scene, built / "again")
+    assert (built / "again" / "scene.ugz").read_bytes() == scene.read_bytes()
     described = json.loads((built / "made" / "page" / "page.json").read_text())
     poses = read_header(DEMO_FILE).training_poses
     assert 1 < len(described["poses"]) <= page.MAX_POSES

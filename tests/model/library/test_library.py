@@ -356,6 +356,11 @@ def compressed(python_scene):
 def test_the_beginning_of_a_compressed_scene_is_a_coarser_scene(library, scene, python_scene, compressed):
     data, ends = compressed
     assert ends[-1] == len(data)
+    counts = [
+        json.loads(library.ultragray_scene_info(Scene(library, data[:end], "load_part").pointer))["gaussian_count"]
+        for end in ends
+    ]
+    assert counts == [0.1 * 50_000, 0.3 * 50_000, 0.6 * 50_000, 50_000]
     settings, poses = {"encoding": "float32", "height": 128, "width": 128}, poses_beside(python_scene, 3)
     whole = scene.render(settings, poses)[1].view(np.float32)
     errors = []
