@@ -30,6 +30,7 @@ PHANTOM = "phantom"
 SETS = (PHANTOM, "spine_phantom", "liver_convex", "ultranerf_liver")
 STEPS, MAX_GAUSSIANS = 400, 60_000
 MOST_FRAMES = 24  # of a sweep, evenly taken
+SIMULATED = 6  # of the phantom, whose frames take seconds
 PERCENTILE = 99.9
 THREADS = 1
 
@@ -73,8 +74,8 @@ def trained(name: str, data_folder: Path) -> tuple[GaussianScene, tuple[Sweep, S
     """A scene, and frames that it was trained from, and that it was not."""
     if name == PHANTOM:
         scene = load_demo_scene()
-        poses = freehand_poses(MOST_FRAMES, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)
-        return scene, (simulated(spread(scene.training_poses)), simulated(poses))
+        poses = freehand_poses(SIMULATED, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)
+        return scene, (simulated(spread(scene.training_poses, SIMULATED)), simulated(poses))
     dataset = load_dataset(data_folder / name)
     path = STAGE / "compressed" / f"{name}.ugr"
     if not path.exists():
@@ -90,8 +91,8 @@ def simulated(poses: np.ndarray) -> Sweep:  # [F, 4, 4]
     return Sweep(images, poses, PHANTOM_PROBE, np.arange(len(poses)), PHANTOM)
 
 
-def spread(values: np.ndarray) -> np.ndarray:
-    chosen: np.ndarray = values[np.unique(np.linspace(0, len(values) - 1, MOST_FRAMES).round().astype(int))]
+def spread(values: np.ndarray, most: int = MOST_FRAMES) -> np.ndarray:
+    chosen: np.ndarray = values[np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))]
     return chosen
 
 
