@@ -30,6 +30,7 @@ import localization
 import measuring
 import methods_tables
 import poses
+import prediction
 import results_tables
 import speckle
 from measuring import Document, Lines, columns, described, heads, kept, read, staged, table
@@ -49,7 +50,10 @@ TARGETS = {
     "methods_tables": "methods",
     **{
         name: name
-        for name in ("ablations", "poses", "hand", "localization", "confidence", "speckle", "environment", "ros")
+        for name in (
+            *("ablations", "poses", "hand", "localization", "confidence"),
+            *("speckle", "environment", "prediction", "ros"),
+        )
     },
     "compressed": "compressed",
     "shards": "test-shards",
@@ -338,6 +342,7 @@ BLOCKS = {
     "console": Block("console", console),
     "frames in a page": Block("browser", frames_in_a_page),
     "environment": Block("environment", environment),
+    "foretold poses": Block("prediction", prediction.foretold_poses),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),
     "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),

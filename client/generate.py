@@ -22,6 +22,7 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.exchange import ros_messages, ros_recording
 from ultragray.geometry import pose
+from ultragray.geometry.motion import Prediction
 from ultragray.geometry.probe import ElevationBeam
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
@@ -37,6 +38,7 @@ ROOTS = {
     "RenderSettings": RenderSettings,
     "SettingsUsed": SettingsUsed,
     "Extrapolation": Extrapolation,
+    "Prediction": Prediction,
     "SliceSettings": SliceSettings,
     "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,

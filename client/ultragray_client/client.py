@@ -420,6 +420,7 @@ class _Client(Group[AnyConnection]):
         timeout_s: float | None = None,
         shared_memory: bool = False,
         reconnect_s: float | None = None,
+        seen_after_ms: float | None = None,
     ) -> PoseStream:
         """A stream of poses: `with client.stream("demo", mode="latest") as stream: stream.send(pose)`.
 
@@ -435,8 +436,15 @@ class _Client(Group[AnyConnection]):
         and a loopback `address`; else InvalidArgument. The arrays of a frame are views of that memory, and stay as they
         are for as long as anything refers to one of them. While 16 frames are held, others come in their messages, as
         do those of more than 16 MiB.
+
+        `seen_after_ms`, 0 to 1000: frames are those of where the probe will be when they are seen, so long after they
+        arrive here; None: of the poses as they were sent. The pose is foretold from those before it and their
+        `measured_ns`, for the median latency of the last frames; `frame.pose` is where, and `frame.prediction` says
+        how far ahead that is, and how wrong it is expected to be.
         """
-        exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
+        exchange = PoseExchange(
+            settings_message(scene, settings), mode, shared_memory=shared_memory, seen_after_ms=seen_after_ms
+        )
         return PoseStream("RenderService.RenderStream", exchange, timeout_s, reconnect_s)
 
     @operation

@@ -37,6 +37,7 @@ __all__ = [
     "LinearProbe",
     "Needle",
     "PhasedProbe",
+    "Prediction",
     "Probe",
     "RadialProbe",
     "RenderJob",
@@ -311,6 +312,15 @@ class Extrapolation:
     supported_share: float | None  # Share of the pixels that Gaussians support: coverage of at least 0.3.
     # Share of the scan lines that have contact with the skin; none where contact is assumed.
     contact_share: float | None = None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How far ahead of its measured pose a frame is, and how wrong its pose is expected to be (root mean square)."""
+
+    ahead_ms: float  # From the time of the newest pose to that of the frame.
+    error_mm: float | None  # Of the position; null: too few poses have come to tell.
+    error_deg: float | None  # Of the rotation, likewise.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from ultragray_client.connection import error_of_frame
@@ -110,6 +111,8 @@ def _remove(path: Path, listener: socket.socket) -> None:
 
 
 MAX_WAITING = 64  # poses of an ordered stream; then its sender waits
+MAX_PREDICT_MS = 1000.0  # that the service foretells a pose
+_LATENCIES = 32  # of the newest frames, whose median is expected of the next
 WINDOW = 2  # answers of a latest stream that may wait for the caller: one comes while the other is looked at
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
 
@@ -138,15 +141,28 @@ class PoseExchange:
     """The messages of a stream: poses numbered from 1 (0 are its settings), and their frames."""
 
     def __init__(
-        self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str, *, shared_memory: bool = False
+        self,
+        settings: rendering_pb2.RenderSettings,
+        mode: StreamMode | str,
+        *,
+        shared_memory: bool = False,
+        seen_after_ms: float | None = None,
     ) -> None:
-        """Raises InvalidArgument for a mode that does not exist, and where this system cannot share memory."""
+        """Raises InvalidArgument for a mode that does not exist, a `seen_after_ms` out of range, and where this system
+        cannot share memory.
+        """
+        if seen_after_ms is not None and not 0.0 <= seen_after_ms <= MAX_PREDICT_MS:
+            raise InvalidArgument(
+                f"seen_after_ms must be from 0 to {MAX_PREDICT_MS:g}, got {seen_after_ms:g}", field="seen_after_ms"
+            )
         try:
             self.mode = StreamMode(mode)
         except ValueError:
             names = ", ".join(known.value for known in StreamMode)
             raise InvalidArgument(f"mode must be one of {names}, got {mode!r}", field="mode") from None
         self._settings = settings
+        self._seen_after_ms = seen_after_ms
+        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._sequence = 0
         self._dropped = 0
         self._memory = SharedMemory() if shared_memory else None
@@ -191,6 +207,7 @@ class PoseExchange:
             pose=pose_message(pose),
             timeout_ms=None if timeout_s is None else 1000.0 * timeout_s,
             client_time_ns=time.monotonic_ns() if measured_ns is None else measured_ns,
+            predict_ms=self._predict_ms(),
         )
         self._sequence += 1
         return message
@@ -210,7 +227,16 @@ class PoseExchange:
             raise error_of_frame(message.error, message.sequence)
         dropped, self._dropped = self._dropped, 0
         data = None if answer.memory is None else answer.memory.taken(message)
-        return frame_from_message(message, sequence=message.sequence, dropped=dropped, data=data)
+        frame = frame_from_message(message, sequence=message.sequence, dropped=dropped, data=data)
+        if frame.latency_ms is not None:
+            self._latencies_ms.append(frame.latency_ms)
+        return frame
+
+    def _predict_ms(self) -> float | None:
+        """From the measurement of the next pose to when its frame will be seen; None: no pose is to be foretold."""
+        if self._seen_after_ms is None:
+            return None
+        return min(self._seen_after_ms + median(self._latencies_ms or [0.0]), MAX_PREDICT_MS)
 
     def close(self) -> None:
         """No frames are asked for any more; those that came stay."""

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ultragray_client.contract import Additions, Encoding, Extrapolation, Probe, RenderSettings, SettingsUsed
+from ultragray_client.contract import (
+    Additions,
+    Encoding,
+    Extrapolation,
+    Prediction,
+    Probe,
+    RenderSettings,
+    SettingsUsed,
+)
 from ultragray_client.errors import InvalidArgument
 from ultragray_client.geometry import FloatArray, PoseLike, pose_message
 from ultragray_client.messages import message_of
@@ -52,6 +60,7 @@ class Frame(SettingsUsed):
     extrapolation: Extrapolation
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here
+    prediction: Prediction | None = None  # in a stream: how `pose` was foretold; None: it is as it was sent
 
     def __repr__(self) -> str:
         x, y, z = self.pose[:3, 3]
@@ -143,6 +152,7 @@ def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropp
         sequence=sequence,
         dropped=dropped,
         latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
+        prediction=from_message(message.prediction, Prediction) if message.HasField("prediction") else None,
     )
 
 

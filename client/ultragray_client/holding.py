@@ -21,6 +21,7 @@ class HoldStill:
 
     most_age_ms: float | None = None  # from `measured_ns` of the pose to now; needs poses that are sent with it
     least_confidence: float | None = None  # 0 to 1
+    most_error_mm: float | None = None  # expected of a foretold pose; needs a stream with `seen_after_ms`
     least_contact: float | None = None  # share of the scan lines, 0 to 1; needs `contact` in the settings
 
     def reason(self, frame: Frame | ClientError | None, *, waited_ms: float = 0.0) -> str | None:
@@ -37,6 +38,10 @@ class HoldStill:
         found, told = frame.extrapolation, "is not told"
         if self.most_age_ms is not None and not (age_ms is not None and age_ms <= self.most_age_ms):
             return f"age {told if age_ms is None else f'of {age_ms:.0f} ms'}"
+        if self.most_error_mm is not None:
+            error_mm = None if frame.prediction is None else frame.prediction.error_mm
+            if not (error_mm is not None and error_mm <= self.most_error_mm):
+                return f"error of the pose {told if error_mm is None else f'of {error_mm:.2f} mm'}"
         for name, value, least in (
             ("confidence", found.confidence, self.least_confidence),
             ("contact", found.contact_share, self.least_contact),

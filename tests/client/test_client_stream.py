@@ -63,6 +63,26 @@ def test_latency_counts_from_the_measurement(client):
         assert stream.receive().latency_ms > 5000.0
 
 
+def test_frames_are_those_of_when_they_are_seen(client):
+    begun_ns, frames = time.monotonic_ns(), []
+    with client.stream("demo", RenderSettings(height=8, width=8), seen_after_ms=100.0) as stream:
+        deadline = Deadline(60)
+        while len(frames) < 60 or frames[-60].prediction.error_mm is None:
+            measured_ns = time.monotonic_ns() - 20_000_000
+            x_mm = 2e-8 * (measured_ns - begun_ns)  # 20 mm/s
+            stream.send(moved(x_mm), measured_ns=measured_ns)
+            frames.append(stream.receive())
+            assert not deadline.passed
+    motion_mm = 0.02 * frames[-1].prediction.ahead_ms
+    assert motion_mm > 0.02 * (100.0 + 20.0)
+    assert frames[-1].pose[0, 3] - x_mm == pytest.approx(motion_mm, rel=0.1)
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
+        stream.send(moved(0.0))
+        assert stream.receive().prediction is None
+    with pytest.raises(errors.InvalidArgument, match="seen_after_ms must be from 0 to 1000, got -1"):
+        client.stream("demo", seen_after_ms=-1.0)
+
+
 def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ultragray_client import Client, HoldStill, RenderSettings
+from ultragray_client.contract import Prediction
 from ultragray_client.errors import DeadlineExceeded
 
 from .conftest import KEY
@@ -29,6 +30,9 @@ def test_a_frame_within_all_limits_is_acted_on(frame):
 @pytest.mark.parametrize(
     ("still", "changes", "expected"),
     [
+        (HoldStill(most_error_mm=0.5), {}, "error of the pose is not told"),
+        (HoldStill(most_error_mm=0.5), {"prediction": Prediction(50.0, None, None)}, "error of the pose is not told"),
+        (HoldStill(most_error_mm=0.5), {"prediction": Prediction(50.0, 0.61, 0.1)}, "error of the pose of 0.61 mm"),
         (HoldStill(most_age_ms=19), {}, "age of 20 ms"),
         (HoldStill(most_age_ms=19), {"latency_ms": None}, "age is not told"),
         (HoldStill(most_age_ms=19), {"latency_ms": float("nan")}, "age of nan ms"),
@@ -39,7 +43,7 @@ def test_a_frame_within_all_limits_is_acted_on(frame):
     ],
 )
 def test_a_limit_holds(frame, still, changes, expected):
-    own = {"latency_ms"} & changes.keys()
+    own = {"latency_ms", "prediction"} & changes.keys()
     told = replace(frame.extrapolation, **{name: changes[name] for name in changes.keys() - own})
     assert still.reason(replace(frame, extrapolation=told, **{name: changes[name] for name in own})) == expected
 

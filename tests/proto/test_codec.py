@@ -52,6 +52,7 @@ PAIRS = [
             "error",
             "dropped",
             "client_time_ns",
+            "prediction",
             "timings",
             "queue_ms",
             "render_ms",

@@ -14,6 +14,7 @@ from typing import Literal
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
+from ultragray.geometry.motion import Prediction
 from ultragray_service.access.principals import Principal, Role, acting, caller
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.errors import StreamNotFound
@@ -28,6 +29,7 @@ class StreamAnswer:
     client_time: float | None
     outcome: RenderResult | UltragrayError
     dropped: int = 0  # poses that were replaced since the answer before
+    prediction: Prediction | None = None  # how the pose of the frame was foretold
 
 
 # The streams that are open at this service, and who watches them.

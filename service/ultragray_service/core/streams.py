@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
@@ -43,6 +44,7 @@ class PoseRequest:
     client_time: float | None  # any number (an int for gRPC): the client gets it back
     plan: Plan  # the same object until the client sends other settings
     pose: FloatArray  # [4, 4] mm, exact
+    prediction: Prediction | None  # how the pose was foretold; None: it is as the client sent it
     deadline: float  # time.monotonic() in seconds
 
 
@@ -219,7 +221,7 @@ class PoseStream:
         self._answers.put_nowait(_Underway(task, sent))
 
     async def _answer(self, request: PoseRequest) -> StreamAnswer:
-        return StreamAnswer(request.sequence, request.client_time, await self._outcome(self._rendered(request)))
+        return _answer_to(request, await self._outcome(self._rendered(request)))
 
     async def _rendered(self, request: PoseRequest) -> RenderResult:
         await self._rendering.limits.frame_turn(request.deadline)
@@ -268,7 +270,7 @@ class PoseStream:
         request, self._current = self._current, None  # perhaps a later one than at the start
         self._window.enter(request.sequence)
         self._advance()
-        return StreamAnswer(request.sequence, request.client_time, outcome)
+        return _answer_to(request, outcome)
 
     async def _rendered_latest(self) -> RenderResult:
         self._is_waiting = True
@@ -286,6 +288,10 @@ class PoseStream:
     def _count_dropped(self) -> None:
         self._dropped += 1
         self._rendering.metrics.count_dropped()
+
+
+def _answer_to(request: PoseRequest, outcome: RenderResult | UltragrayError) -> StreamAnswer:
+    return StreamAnswer(request.sequence, request.client_time, outcome, prediction=request.prediction)
 
 
 def unexpected(error: Exception) -> UltragrayError:
@@ -320,6 +326,9 @@ class Message:
     asks: bool = True  # for a frame
     pose: Callable[[], FloatArray]  # [4, 4] mm, exact
     timeout_s: Callable[[], float | None] = nothing  # that the pose may wait; None: the default of the service
+    # When the pose was measured, and for how much later its frame is to be, both in seconds of the client's clock.
+    # None: for the pose as it was measured.
+    predict_s: Callable[[], tuple[float, float] | None] = nothing
 
 
 def unreadable(error: UltragrayError, *, of_settings: bool = False, **numbers: Any) -> Message:
@@ -363,6 +372,8 @@ class FrameStream:
     ) -> None:
         self._rendering, self._transport, self._unset = rendering, transport, unset
         self._plan: Plan | None = None
+        self._poses_of: tuple[str, str | None] | None = None  # scene, and registration that leads into it
+        self._path = PathPredictor()  # of the placed poses
         self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
@@ -399,8 +410,13 @@ class FrameStream:
             if self._unset is None:
                 raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
             self._plan = await self._resolve(self._unset)
-        pose, deadline = self._plan.placed(message.pose()), self._rendering.planner.deadline(message.timeout_s())
-        return PoseRequest(message.sequence, message.client_time, self._plan, pose, deadline)
+        deadline = self._rendering.planner.deadline(message.timeout_s())
+        pose, prediction = self._plan.placed(message.pose()), None
+        if (times_s := message.predict_s()) is not None:
+            measured_s, ahead_s = times_s
+            self._path.observe(measured_s, pose)
+            pose, prediction = self._path.predict(measured_s + ahead_s)
+        return PoseRequest(message.sequence, message.client_time, self._plan, pose, prediction, deadline)
 
     async def _change_settings(self, message: Message) -> None:
         unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
@@ -409,12 +425,27 @@ class FrameStream:
             self._unset = unset
         else:
             self._plan = await self._resolve(settings)
+            scene, request = settings
+            if self._poses_of != (scene, request.registration):
+                self._poses_of, self._path = (scene, request.registration), PathPredictor()
 
     async def _resolve(self, settings: SceneSettings) -> Plan:
         scene, request = settings
         return await self._rendering.planner.plan(
             scene, request, request.encoding, path="settings", registration=request.registration
         )
+
+
+def times_to_predict(client_time: float | None, per_s: float, predict_ms: float, name: str) -> tuple[float, float]:
+    """`Message.predict_s` of a client's numbers; `per_s`: units of `client_time`, whose field is `name`, in a second.
+
+    Raises InvalidArgument.
+    """
+    if not 0.0 <= predict_ms <= MAX_AHEAD_MS:
+        raise InvalidArgument(f"predict_ms must be from 0 to {MAX_AHEAD_MS:g}, got {predict_ms:g}", field="predict_ms")
+    if client_time is None:
+        raise InvalidArgument(f"{name} must be given beside predict_ms: when the pose was measured", field=name)
+    return client_time / per_s, predict_ms / 1e3
 
 
 def checked_s(name: str, milliseconds: float) -> float:

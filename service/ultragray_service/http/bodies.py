@@ -23,6 +23,7 @@ from ultragray.contract import Contract, annotated_fields, described, error_unde
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, UltragrayError
 from ultragray.exchange.exports.exporter import Annotation
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.motion import MAX_AHEAD_MS
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
@@ -325,7 +326,16 @@ class StreamMessage(Contract):
     pose: Pose | None = described("null: only the settings change.", None, error=InvalidPose)
     mode: StreamMode | None = described("Of the stream; read from its first message. Default: ordered.", None)
     timeout_ms: float | None = described("Later this pose is not rendered.", None, above=0, high=MAX_TIMEOUT_MS)
-    client_time_ms: float | None = described("Any number; the answer carries it.", None)
+    client_time_ms: float | None = described(
+        "Any number, such as when the pose was measured; the answer carries it.", None
+    )
+    predict_ms: float | None = described(
+        "The frame is to be that of where the probe will be so long after client_time_ms, when its pose was measured: "
+        "foretold from the poses of the stream that have this, too. Absent: the frame of the pose itself.",
+        None,
+        low=0,
+        high=MAX_AHEAD_MS,
+    )
     window: int | None = described(
         "Of a latest stream, read from its first message: answers that may wait to be acknowledged. Default: the "
         "client acknowledges none.",

@@ -32,6 +32,7 @@ from ultragray_service.core.streams import (
     Message,
     StreamMode,
     checked_s,
+    times_to_predict,
     unreadable,
 )
 from ultragray_service.errors import Refusal
@@ -95,9 +96,16 @@ class CallTransport:
             own_s = checked_s("timeout_ms", message.timeout_ms)
             return own_s if left_s is None else min(left_s, own_s)
 
+        client_time_ns = message.client_time_ns if has("client_time_ns") else None
+
+        def predict_s() -> tuple[float, float] | None:
+            if not has("predict_ms"):
+                return None
+            return times_to_predict(client_time_ns, 1e9, message.predict_ms, "client_time_ns")
+
         return Message(
             sequence=message.sequence,
-            client_time=message.client_time_ns if has("client_time_ns") else None,
+            client_time=client_time_ns,
             mode=partial(self._begun, message),
             window=message.window or None,
             acknowledged=message.acknowledged if has("acknowledged") else None,
@@ -105,6 +113,7 @@ class CallTransport:
             asks=has("pose") or not (has("settings") or has("acknowledged")),
             pose=pose,
             timeout_s=timeout_s,
+            predict_s=predict_s,
         )
 
     def _begun(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
@@ -135,6 +144,8 @@ class CallTransport:
             error = to_message(Refusal.of(answer.outcome), scenes_pb2.Error)
             message = rendering_pb2.Frame(sequence=answer.sequence, error=error, **about)
         else:
+            if answer.prediction is not None:
+                about["prediction"] = to_message(answer.prediction, rendering_pb2.Prediction)
             message = serialized_frame(answer.outcome, answer.sequence, **about)
         await (self._context if self._socket is None else self._socket).write(message)
 

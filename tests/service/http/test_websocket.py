@@ -81,6 +81,38 @@ def test_an_answer_has_what_its_message_gave(open_stream):
     assert len(data) == 4 * HEIGHT * WIDTH
 
 
+def test_a_frame_is_that_of_where_the_probe_will_be(open_stream):
+    stream = open_stream()
+    for k in range(60):  # 30 mm/s
+        stream.send(sequence=k, pose=at(0.3 * k), client_time_ms=10.0 * k, predict_ms=50.0)
+    answers = [stream.receive()[0] for _ in range(60)]
+    assert answers[-1]["pose"][0][3] == pytest.approx(0.3 * 59 + 1.5, abs=0.1)
+    assert answers[-1]["prediction"]["ahead_ms"] == 50.0
+    assert answers[-1]["prediction"]["error_mm"] < 1.5
+    about, _ = stream.ask(sequence=60, pose=at(7.0), client_time_ms=600.0)
+    assert (about["pose"][0][3], about["prediction"]) == (7.0, None)
+    for message, field in (
+        ({"client_time_ms": 1.0, "predict_ms": 1001}, "predict_ms"),
+        ({"predict_ms": 5}, "client_time_ms"),
+    ):
+        stream.send(sequence=61, pose=at(0.0), **message)
+        assert stream.receive()[0]["error"]["field"] == field
+
+
+def test_another_registration_or_scene_begins_another_path(open_stream):
+    stream = open_stream()
+    for k in range(30):
+        stream.ask(
+            sequence=k,
+            pose=at(0.3 * k),
+            client_time_ms=10.0 * k,
+            predict_ms=50.0,
+            settings={"height": 8 + k, "width": 8},
+        )
+    about, _ = stream.ask(sequence=31, pose=at(9.0), client_time_ms=300.0, predict_ms=50.0)
+    assert about["pose"][0][3] > 9.5, "another image size does not"
+
+
 def test_ordered_streams_answer_every_pose_and_settings_may_change(open_stream):
     stream = open_stream()
     for k in range(30):

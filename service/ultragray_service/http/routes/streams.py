@@ -16,11 +16,12 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.motion import Prediction
 from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer, StreamSummary, Watcher
 from ultragray_service.core.poses import FrameHeader
-from ultragray_service.core.streams import FrameStream, Message, StreamMode, nothing, unreadable
+from ultragray_service.core.streams import FrameStream, Message, StreamMode, nothing, times_to_predict, unreadable
 from ultragray_service.errors import Refusal, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
 from ultragray_service.http.dependencies import SceneName, ServiceDep, problems
@@ -46,6 +47,8 @@ class Answer:
 class FrameMessage(FrameHeader, Answer):
     """The JSON before the pixels of a frame."""
 
+    prediction: Prediction | None = described("How its pose was foretold; null: it is as it was sent.")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RefusalMessage(Answer):
@@ -67,6 +70,7 @@ def frame_bytes(answer: StreamAnswer) -> bytes:
             sequence=answer.sequence,
             client_time_ms=answer.client_time,
             dropped=answer.dropped,
+            prediction=answer.prediction,
         )
     )
     header += b" " * (-(4 + len(header)) % _ALIGNMENT)
@@ -163,7 +167,7 @@ def _message_of(text: str | None, scene: str) -> Message:
             numbers = _Numbers()
         of_settings = (error.field or "").startswith("settings")
         return unreadable(error, of_settings=of_settings, sequence=numbers.sequence, client_time=numbers.client_time_ms)
-    pose, settings, timeout_ms = message.pose, message.settings, message.timeout_ms
+    pose, settings, timeout_ms, predict_ms = message.pose, message.settings, message.timeout_ms, message.predict_ms
     return Message(
         sequence=message.sequence,
         client_time=message.client_time_ms,
@@ -174,6 +178,9 @@ def _message_of(text: str | None, scene: str) -> Message:
         asks=pose is not None,
         pose=nothing if pose is None else partial(pose.exact, "pose"),  # type: ignore[arg-type]  # it asks for none
         timeout_s=lambda: None if timeout_ms is None else timeout_ms / 1000.0,
+        predict_s=lambda: (
+            None if predict_ms is None else times_to_predict(message.client_time_ms, 1e3, predict_ms, "client_time_ms")
+        ),
     )
 
 
