@@ -114,10 +114,10 @@ def foretold_poses(runs: Document) -> Lines:
     """Errors by path and time ahead."""
     text = "{without[0]:.2f} → {with[0]:.2f} mm, {without[1]:.2f} → {with[1]:.2f}°"
     rows = (
-        {"path": name, **{ms: text.format_map(found) if found else "–" for ms, found in run["ahead"].items()}}
+        {"path": name, **{f"in {ms}": text.format_map(found) if found else "–" for ms, found in run["ahead"].items()}}
         for name, run in runs.items()
     )
-    return columns(rows, {"Path": "{path}", **{f"{ms:,} ms": f"{{{ms}}}" for ms in AHEAD_MS}})
+    return columns(rows, {"Path": "{path}", **{f"{ms:,} ms": f"{{in {ms}}}" for ms in AHEAD_MS}})
 
 
 RUNS = {
