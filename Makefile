@@ -13,7 +13,7 @@ PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard d
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py tests/model/library/test_generated.py tests/engines/test_generated.py
 PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples engines
-CPP_SOURCES := $(wildcard model/kernels/*.[ch]pp model/kernels/*.inl model/library/*.[ch]pp)
+CPP_SOURCES := $(wildcard model/kernels/*.[ch]pp model/kernels/*.inl model/library/*.[ch]pp engines/examples/*.[ch]pp)
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*') browser/src/pose.ts

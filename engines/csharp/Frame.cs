@@ -148,7 +148,8 @@ namespace Ultragray
             }
         }
 
-        internal void Refuse(long number, string sentence)
+        /// <summary>Tells what is wrong, null: nothing, of a pose by its number, else by 0.</summary>
+        internal void Tell(long number, string sentence)
         {
             lock (this)
             {

@@ -78,7 +78,7 @@ namespace Ultragray
                     problem = await Connected(socket, open);
                 if (stop.IsCancellationRequested) break;
                 if (exchange.Answered > before) delay = FirstDelay;
-                exchange.Refuse(0, problem);
+                exchange.Tell(0, problem);
                 try
                 {
                     await Task.Delay(delay, stop.Token);
@@ -102,6 +102,7 @@ namespace Ultragray
                 isOpen = true;
                 lock (exchange)
                 {
+                    exchange.Tell(0, null);
                     connection = open;
                     sent = exchange.Answered;
                     settled = 0;
@@ -144,6 +145,7 @@ namespace Ultragray
                         while (!open.IsCancellationRequested && !WriteMessage())
                             Monitor.Wait(exchange, exchange.Asked > sent ? LeastBetweenMs : Timeout.Infinite);
                     }
+                    open.ThrowIfCancellationRequested();
                     socket.SendAsync(message.Written, WebSocketMessageType.Text, true, open).GetAwaiter().GetResult();
                 }
             }
@@ -220,7 +222,7 @@ namespace Ultragray
             reader.Begin(arriving.Buffer, 0, count);
             refusal.Read(reader);
             lock (exchange) settled = 0;
-            exchange.Refuse(refusal.Sequence, refusal.Error.Detail);
+            exchange.Tell(refusal.Sequence, refusal.Error.Detail);
             if (Array.IndexOf(Passing, refusal.Error.Reason) >= 0) AskAgain(exchange.Asked);
         }
 

@@ -55,13 +55,13 @@ namespace Ultragray
                 byte[] file = read();
                 using (var scene = Native.ultragray_load(file, (UIntPtr)file.Length))
                 {
-                    if (scene.IsInvalid) exchange.Refuse(0, Native.Problem());
+                    if (scene.IsInvalid) exchange.Tell(0, Native.Problem());
                     else RenderAll(scene);
                 }
             }
             catch (Exception error) // of the reading, or there is no libultragray
             {
-                exchange.Refuse(0, error.GetBaseException().Message);
+                exchange.Tell(0, error.GetBaseException().Message);
             }
         }
 
@@ -92,7 +92,7 @@ namespace Ultragray
                     viewed = set;
                 }
                 if (!view.IsInvalid && Render(view, pose, asked, matrix, arriving)) exchange.Publish(asked, ref arriving);
-                else exchange.Refuse(asked, Native.Problem());
+                else exchange.Tell(asked, Native.Problem());
             }
             view?.Dispose();
         }

@@ -4,6 +4,7 @@ import hashlib
 import json
 import socket
 import subprocess
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -19,6 +20,7 @@ from ultragray.rendering.tools import Tool
 
 from ..client.proxy import Proxy
 from ..model.library.test_library import of_python
+from .conftest import HERE
 
 KEY = "0123456789abcdef-engines"
 
@@ -47,6 +49,16 @@ def rendered(
 
 def sha256(data):
     return hashlib.sha256(data).hexdigest()
+
+
+def test_the_client_needs_no_type_beyond_net_standard(build, client):
+    standard = Path("/usr/lib/mono/4.5/Facades/netstandard.dll")
+    cecil = sorted(Path("/usr/lib/mono/gac/Mono.Cecil").glob("0.11*/Mono.Cecil.dll"))
+    if not cecil or not standard.is_file():
+        pytest.skip("there is no reader of assemblies (Debian's libmono-cecil-private-cil) or standard")
+    types = build("Types.exe", [HERE / "Types.cs"], cecil[:1])
+    told = subprocess.run(["mono", types, standard, client], check=True, capture_output=True, text=True).stdout
+    assert told == "of 2715\n"  # types of .NET Standard 2.1 as Mono has it
 
 
 def test_the_service_over_http(driver, start, service, data_folder, demo_scene):

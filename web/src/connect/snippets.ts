@@ -96,7 +96,8 @@ console.log(height, width, pixels.length, JSON.parse(answer.headers.get("X-Ultra
 
 function csharp(target: Target, asked: Asked): string {
   const key = target.key_required ? `\n            request.Headers.Add("X-API-Key", "${KEY}");` : "";
-  return `using System;
+  return `// Live, as a stream, and in Unity: by the client in engines/csharp.
+using System;
 using System.Linq;
 using System.Net.Http;
 using System.Text;
