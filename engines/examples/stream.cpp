@@ -4,8 +4,11 @@
 // The newest pose goes first, and a call that breaks is followed by another: what a robot or an engine wants.
 #include <grpcpp/grpcpp.h>
 
+#include <chrono>
 #include <iostream>
 #include <optional>
+#include <set>
+#include <thread>
 
 #include "local_frames.hpp"
 #include "ultragray/v1/rendering.grpc.pb.h"
@@ -15,6 +18,8 @@ namespace v1 = ultragray::v1;
 namespace {
 
 constexpr int HEIGHT = 128, WIDTH = 96;
+const std::set<std::string> PASSING = {"NOT_READY", "DRAINING",
+                                       "QUEUE_FULL"};  // refusals of a service that starts, stops or is busy
 
 class FrameStream {
  public:
@@ -31,14 +36,21 @@ class FrameStream {
         request.set_sequence(++sequence_);
         for (const double value : pose.matrix) request.mutable_pose()->mutable_matrix()->add_values(value);
         v1::Frame frame;
-        while (!ask(request) || !call_->Read(&frame)) {
-            const grpc::Status status = call_->Finish();
-            std::cerr << "the stream broke, and is opened again: " << status.error_message() << "\n";
-            if (status.error_code() != grpc::StatusCode::UNAVAILABLE) throw std::runtime_error(status.error_message());
-            open();
+        while (true) {
+            if (!ask(request) || !call_->Read(&frame)) {
+                const grpc::Status status = call_->Finish();
+                if (status.error_code() != grpc::StatusCode::UNAVAILABLE) throw std::runtime_error(status.error_message());
+                std::cerr << "the stream broke, and is opened again: " << status.error_message() << "\n";
+                open();
+            } else if (!frame.has_error()) {
+                return frame;
+            } else if (PASSING.count(frame.error().reason()) == 0) {
+                throw std::runtime_error(frame.error().detail());
+            } else {
+                std::this_thread::sleep_for(std::chrono::milliseconds(200));
+                is_first_ = true;  // the settings may have been refused with it
+            }
         }
-        if (frame.has_error()) throw std::runtime_error(frame.error().detail());
-        return frame;
     }
 
  private:
