@@ -37,7 +37,7 @@ namespace Ultragray
 
         // Of the connection, all written under the exchange's lock:
         CancellationTokenSource connection;
-        long sent, acknowledged, settled;
+        long sent, acknowledged, settled, refused;
 
         internal FrameStream(Service service, string scene, RenderSettings settings, string name)
         {
@@ -155,10 +155,11 @@ namespace Ultragray
         bool WriteMessage()
         {
             bool asks = exchange.Asked > sent && (sent <= exchange.Answered || sinceSent.ElapsedMilliseconds >= LeastBetweenMs);
-            if (!asks && exchange.Taken <= acknowledged) return false;
+            long taken = Math.Max(exchange.Taken, refused); // a refusal takes room, too
+            if (!asks && taken <= acknowledged) return false;
             message.Clear();
             message.Open('{');
-            acknowledged = exchange.Taken;
+            acknowledged = taken;
             message.Member("acknowledged", acknowledged);
             if (asks)
             {
@@ -221,7 +222,12 @@ namespace Ultragray
             var refusal = new RefusalMessage();
             reader.Begin(arriving.Buffer, 0, count);
             refusal.Read(reader);
-            lock (exchange) settled = 0;
+            lock (exchange)
+            {
+                settled = 0;
+                refused = Math.Max(refused, refusal.Sequence);
+                exchange.Pulse();
+            }
             exchange.Tell(refusal.Sequence, refusal.Error.Detail);
             if (Array.IndexOf(Passing, refusal.Error.Reason) >= 0) AskAgain(exchange.Asked);
         }

@@ -42,14 +42,13 @@ class FrameStream {
                 if (status.error_code() != grpc::StatusCode::UNAVAILABLE) throw std::runtime_error(status.error_message());
                 std::cerr << "the stream broke, and is opened again: " << status.error_message() << "\n";
                 open();
-            } else if (!frame.has_error()) {
-                return frame;
-            } else if (PASSING.count(frame.error().reason()) == 0) {
-                throw std::runtime_error(frame.error().detail());
-            } else {
-                std::this_thread::sleep_for(std::chrono::milliseconds(200));
-                is_first_ = true;  // the settings may have been refused with it
+                continue;
             }
+            answered_ = frame.sequence();
+            if (!frame.has_error()) return frame;
+            if (PASSING.count(frame.error().reason()) == 0) throw std::runtime_error(frame.error().detail());
+            std::this_thread::sleep_for(std::chrono::milliseconds(200));
+            is_first_ = true;  // the settings may have been refused with it
         }
     }
 
@@ -71,9 +70,8 @@ class FrameStream {
             settings.set_scene(scene_);
             settings.set_height(HEIGHT);
             settings.set_width(WIDTH);
-        } else {
-            request.set_acknowledged(sequence_ - 1);  // the frame before was taken: there is room
         }
+        request.set_acknowledged(answered_);  // the answer before was taken: there is room
         is_first_ = false;
         return call_->Write(request);
     }
@@ -82,7 +80,7 @@ class FrameStream {
     std::string scene_;
     std::unique_ptr<grpc::ClientContext> context_;
     std::unique_ptr<grpc::ClientReaderWriter<v1::RenderStreamRequest, v1::Frame>> call_;
-    uint64_t sequence_ = 0;
+    uint64_t sequence_ = 0, answered_ = 0;
     bool is_first_ = true;
 };
 
