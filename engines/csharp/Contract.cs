@@ -599,6 +599,28 @@ namespace Ultragray
         }
     }
 
+    /// <summary>How far ahead of its measured pose a frame is, and how wrong its pose is expected to be (root mean square).</summary>
+    public sealed class Prediction : IReadable
+    {
+        /// <summary>From the time of the newest pose to that of the frame.</summary>
+        public double AheadMs { get; set; }
+        /// <summary>Of the position; null: too few poses have come to tell.</summary>
+        public double? ErrorMm { get; set; }
+        /// <summary>Of the rotation, likewise.</summary>
+        public double? ErrorDeg { get; set; }
+        public void Read(JsonReader json)
+        {
+            if (!json.Enter('{')) return;
+            while (json.NextMember())
+            {
+                if (json.Named("ahead_ms")) AheadMs = json.Number();
+                else if (json.Named("error_mm")) ErrorMm = json.NumberOrNull();
+                else if (json.Named("error_deg")) ErrorDeg = json.NumberOrNull();
+                else json.Skip();
+            }
+        }
+    }
+
     /// <summary>The JSON before the pixels of a frame.</summary>
     public sealed class FrameHeader : IReadable
     {
@@ -658,6 +680,8 @@ namespace Ultragray
         public string[] Outputs { get; set; }
         /// <summary>Of the pixels.</summary>
         public PixelEncoding Encoding { get; set; }
+        /// <summary>How its pose was foretold; null: it is as it was sent.</summary>
+        public Prediction Prediction { get; set; }
         public void Read(JsonReader json)
         {
             if (!json.Enter('{')) return;
@@ -691,12 +715,13 @@ namespace Ultragray
                 else if (json.Named("picture")) Picture = json.Object(Picture);
                 else if (json.Named("outputs")) Outputs = json.Texts(Outputs);
                 else if (json.Named("encoding")) Encoding = (PixelEncoding)json.Word(Words.PixelEncoding);
+                else if (json.Named("prediction")) Prediction = json.Object(Prediction);
                 else json.Skip();
             }
         }
         internal static readonly string[] Texts = { "scene", "scene_sha256", "renderer", "below_min_confidence", "contact", "speckle", "registration", "encoding" };
         internal static readonly string[] TextLists = { "outputs" };
-        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture" };
+        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction" };
     }
 
     /// <summary>An error where a call as a whole does not fail.</summary>
