@@ -312,7 +312,7 @@ browser/node_modules/.package-lock.json: browser/package-lock.json
 	@npm --prefix browser ci --silent --no-audit --no-fund
 	@touch $@
 
-$(BROWSER): browser/node_modules/.package-lock.json $(KERNEL_SOURCES) web/openapi.json $(wildcard browser/*.* browser/src/*.ts browser/page/*)
+$(BROWSER): browser/node_modules/.package-lock.json $(KERNEL_SOURCES) web/openapi.json $(wildcard browser/*.* browser/src/*.ts browser/src/gpu/* browser/page/*)
 	@command -v emcmake > /dev/null || { echo "WebAssembly is compiled by Emscripten: sudo apt-get install emscripten"; exit 1; }
 	@npm --prefix browser run --silent build
 	@touch $@

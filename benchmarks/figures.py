@@ -251,7 +251,27 @@ def frames_in_a_page(measured: Document) -> Lines:
         ),
         ("Page and renderer", f"{measured['page_gzip_kb']:.0f} KB gzipped"),
     ]
+    if "webgpu" in measured:
+        drawn = "{side}x{side} by WebGPU on {adapter}".format_map(measured["webgpu"])
+        rows.append((drawn, "{ms:g} ms, {frames_per_s:g} frames/s".format_map(measured["webgpu"])))
     return table(("What", "Measured"), rows)
+
+
+def operations_of_a_frame(measured: Document) -> Lines:
+    """What a frame costs by the plan that CUDA and WebGPU share, counted."""
+    work = measured["work_per_frame"]["90000"]
+    giga = work["operations"] / 1e9
+    rows = [
+        ("Gaussians that the image plane cuts", f"{work['slices']:,.0f} of {work['gaussians']:,}"),
+        ("Evaluations of a Gaussian at a pixel", f"{work['pixel_evaluations'] / 1e6:.1f} million"),
+        ("Floating-point operations", f"{giga:.2f} billion"),
+        (
+            "60 frames/s",
+            f"{60 * giga:.0f} billion a second: {6 * giga:.0f}% of a GPU of 1 TFLOPS, {3 * giga:.0f}% of 2",
+        ),
+        ("2,000 frames/s", f"{2 * giga:.1f} TFLOPS"),
+    ]
+    return table(("A frame of 512x512", "Counted"), rows)
 
 
 def console(measured: Document) -> Lines:
@@ -341,6 +361,7 @@ BLOCKS = {
     "shards": Block("shards", shards),
     "console": Block("console", console),
     "frames in a page": Block("browser", frames_in_a_page),
+    "operations of a frame": Block("cuda", operations_of_a_frame),
     "environment": Block("environment", environment),
     "foretold poses": Block("prediction", prediction.foretold_poses),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),

@@ -1,7 +1,7 @@
 /** Builds dist/, and the files of the exported page in the Python package: types of the contract, the modules, and the renderer in WebAssembly, which Debian's emscripten compiles. */
 
 import { execFileSync } from "node:child_process";
-import { copyFileSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
+import { copyFileSync, cpSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 import openapiTS, { astToString } from "openapi-typescript";
 
@@ -11,6 +11,8 @@ const run = (command, ...words) => execFileSync(command, words, { cwd: here(".")
 mkdirSync(here("src/generated"), { recursive: true });
 const document = JSON.parse(readFileSync(here("../web/openapi.json"), "utf8"));
 writeFileSync(here("src/generated/openapi.ts"), astToString(await openapiTS(document)));
+const shader = (name) => `export const ${name} = ${JSON.stringify(readFileSync(here(`src/gpu/${name}.wgsl`), "utf8"))};\n`;
+writeFileSync(here("src/generated/shaders.ts"), ["common", "slice", "draw", "finish"].map(shader).join("")); // a page's policy fetches no text
 run(here("node_modules/.bin/tsc"));
 
 const build = here("../build/browser");
@@ -21,4 +23,4 @@ copyFileSync(`${build}/ultragray.wasm`, here("dist/ultragray.wasm"));
 const page = here("../model/ultragray/exchange/page");
 mkdirSync(page, { recursive: true });
 for (const name of readdirSync(here("page"))) copyFileSync(here(`page/${name}`), `${page}/${name}`);
-for (const name of readdirSync(here("dist")).filter((one) => /\.(js|wasm)$/.test(one))) copyFileSync(here(`dist/${name}`), `${page}/${name}`);
+cpSync(here("dist"), page, { recursive: true, filter: (name) => !name.endsWith(".d.ts") });

@@ -14,15 +14,52 @@ interface Exports {
   ultragray_frame_bytes(view: number): number;
   ultragray_free_view(view: number): void;
   ultragray_render(view: number, poses: number, count: number, threads: number, pixels: number, extrapolations: number): number;
+  ultragray_gaussians(scene: number, count: number): number;
+  ultragray_harmonics(scene: number): number;
+  ultragray_plan_of(view: number, pose: number, plan: number): number;
+  ultragray_finish(view: number, pose: number, planes: number, threads: number, pixels: number, extrapolation: number): number;
   ultragray_problem(): number;
 }
 
 /** How much of a file is at hand. */
 export type Extent = "whole" | "beginning";
 
+/** A frame, and its ultragray_extrapolation, field by field; NaN: not known. */
+export interface Rendered {
+  pixels: Uint8Array<ArrayBuffer>;
+  figures: Float64Array;
+}
+
+/** The Gaussians of a scene: see ultragray_gaussians. The arrays are there until the memory grows. */
+export interface Gaussians {
+  count: number;
+  degree: number;
+  sigmoid: boolean;
+  gaussians: Float32Array<ArrayBuffer>; // [count, 12]
+  harmonics: Float32Array<ArrayBuffer>; // [count, (degree + 1)^2]
+}
+
+/** ultragray_plan: what the planes of a pose are drawn by; `planes`: whether B-mode, echo, transmittance, coverage are wanted. */
+export interface Plan {
+  axes: number[];
+  origin: number[];
+  near: number;
+  row: number;
+  most: number;
+  start: number;
+  pitch: number; // from line to line
+  beam: number[];
+  fanned: boolean;
+  wrap: boolean;
+  height: number;
+  width: number;
+  planes: boolean[];
+}
+
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
 const POSE_BYTES = 128;
 const FIGURES = 5; // of ultragray_extrapolation, a double each
+const PLAN_NUMBERS = 29;
 
 /** One instance of the module, with a memory of its own. Whatever is wrong with an input is an Error, in a sentence. */
 export class Library {
@@ -65,27 +102,77 @@ export class Library {
     this.exports.ultragray_free_view(view);
   }
 
-  /** The frame of a pose [4, 4], row by row, and its ultragray_extrapolation, field by field; NaN: not known. */
-  render(view: number, pose: readonly number[]): { pixels: Uint8Array<ArrayBuffer>; figures: Float64Array } {
-    const size = this.exports.ultragray_frame_bytes(view);
-    const before = POSE_BYTES + 8 * FIGURES;
-    return this.#with(new Uint8Array(before + size), (at) => {
+  /** The frame of a pose [4, 4], row by row. */
+  render(view: number, pose: readonly number[]): Rendered {
+    return this.#frame(view, pose, 0, (at, figures, pixels) => this.exports.ultragray_render(view, at, 1, 1, pixels, figures));
+  }
+
+  gaussians(scene: number): Gaussians {
+    const info = JSON.parse(this.#text(this.exports.ultragray_scene_info(scene))) as { sh_degree?: number; intensity?: string };
+    const degree = info.sh_degree ?? 0;
+    const [at, count] = this.#room(4, (count) => {
+      const at = this.exports.ultragray_gaussians(scene, count);
+      return [at, new Uint32Array(this.exports.memory.buffer, count, 1)[0]!];
+    });
+    const floats = (at: number, length: number): Float32Array<ArrayBuffer> => new Float32Array(this.exports.memory.buffer as ArrayBuffer, at, length);
+    return {
+      count,
+      degree,
+      sigmoid: info.intensity === "sigmoid",
+      gaussians: floats(at, 12 * count),
+      harmonics: floats(this.exports.ultragray_harmonics(scene), (degree + 1) ** 2 * count),
+    };
+  }
+
+  plan(view: number, pose: readonly number[]): Plan {
+    return this.#room(POSE_BYTES + 8 * PLAN_NUMBERS, (at) => {
       new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
-      if (this.exports.ultragray_render(view, at, 1, 1, at + before, at + POSE_BYTES) !== 0) this.#fail();
+      if (this.exports.ultragray_plan_of(view, at, at + POSE_BYTES) !== 0) this.#fail();
+      const numbers = [...new Float64Array(this.exports.memory.buffer, at + POSE_BYTES, PLAN_NUMBERS)];
+      const next = (count: number): number[] => numbers.splice(0, count);
+      const [axes, origin] = [next(9), next(3)];
+      const [near, row, most, start, span] = next(5) as [number, number, number, number, number];
+      const beam = next(4);
+      const [fanned, wrap] = next(2).map(Boolean) as [boolean, boolean];
+      const [height, width] = next(2) as [number, number];
+      return { axes, origin, near, row, most, start, pitch: span / width, beam, fanned, wrap, height, width, planes: numbers.map(Boolean) };
+    });
+  }
+
+  /** The frame of a pose whose planes, [H, W] one after another, were drawn by its plan. */
+  finish(view: number, pose: readonly number[], planes: Float32Array): Rendered {
+    return this.#frame(view, pose, planes.byteLength, (at, figures, pixels) => {
+      const drawn = figures + 8 * FIGURES;
+      new Float32Array(this.exports.memory.buffer, drawn, planes.length).set(planes);
+      return this.exports.ultragray_finish(view, at, drawn, 1, pixels, figures);
+    });
+  }
+
+  /** A frame that `draw` writes into the memory; the pose, figures, room for so many bytes and pixels follow each other. */
+  #frame(view: number, pose: readonly number[], bytes: number, draw: (pose: number, figures: number, pixels: number) => number): Rendered {
+    const size = this.exports.ultragray_frame_bytes(view);
+    return this.#room(POSE_BYTES + 8 * FIGURES + bytes + size, (at) => {
+      const figures = at + POSE_BYTES;
+      const pixels = figures + 8 * FIGURES + bytes;
+      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
+      if (draw(at, figures, pixels) !== 0) this.#fail();
       const { buffer } = this.exports.memory;
-      return {
-        pixels: new Uint8Array(buffer).slice(at + before, at + before + size),
-        figures: new Float64Array(buffer, at + POSE_BYTES, FIGURES).slice(),
-      };
+      return { pixels: new Uint8Array(buffer).slice(pixels, pixels + size), figures: new Float64Array(buffer, figures, FIGURES).slice() };
     });
   }
 
   /** What `act` makes of bytes that are in the memory while it runs. */
   #with<Result>(bytes: Uint8Array, act: (at: number) => Result): Result {
-    const at = this.exports.malloc(bytes.length);
+    return this.#room(bytes.length, (at) => {
+      new Uint8Array(this.exports.memory.buffer).set(bytes, at);
+      return act(at);
+    });
+  }
+
+  #room<Result>(bytes: number, act: (at: number) => Result): Result {
+    const at = this.exports.malloc(bytes);
     if (at === 0) throw new Error("the memory does not suffice");
     try {
-      new Uint8Array(this.exports.memory.buffer).set(bytes, at);
       return act(at);
     } finally {
       this.exports.free(at);

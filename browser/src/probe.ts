@@ -1,7 +1,8 @@
 /** `<ultragray-probe src="scene.ugr" pose="…">`: a live image that is steered by pointer, keys and gamepad.
  *
  * Attributes: `src`, the address of a scene file that is rendered here, or `service` and `scene` of one that a service
- * renders; `pose`, 16 numbers; `settings`, JSON. Properties of the same names (a pose as numbers, settings as an object).
+ * renders; `pose`, 16 numbers; `settings`, JSON; `renderer`, what draws here (auto, wasm, webgpu). Properties:
+ * `pose`, numbers, and `settings`, an object.
  * Events: `frame` (detail: the Frame and its pose), `progress` (detail: the share of the file that frames show, while a
  * compressed one arrives), `problem` (detail: an Error).
  */
@@ -9,6 +10,7 @@
 import { IDENTITY, type Pose } from "./pose.js";
 import { Scene, type Frame, type Settings } from "./scene.js";
 import { moved, type Motion } from "./steering.js";
+import type { RendererChoice } from "./worker.js";
 
 const STEP_MM = 0.5;
 const STEP_DEG = 1;
@@ -35,7 +37,7 @@ const STYLE = `
 `;
 
 export class UltragrayProbe extends HTMLElement {
-  static readonly observedAttributes = ["src", "service", "scene", "pose", "settings"];
+  static readonly observedAttributes = ["src", "service", "scene", "renderer", "pose", "settings"];
 
   #canvas = document.createElement("canvas");
   #scene: Promise<Scene> | undefined;
@@ -122,7 +124,8 @@ export class UltragrayProbe extends HTMLElement {
       this.#draw();
       this.dispatchEvent(new CustomEvent("progress", { detail: share }));
     };
-    const scene = await Scene.load(address, { progress });
+    const renderer = (this.getAttribute("renderer") ?? "auto") as RendererChoice;
+    const scene = await Scene.load(address, { progress, renderer });
     scene.whole.catch((error: Error) => this.dispatchEvent(new CustomEvent("problem", { detail: error })));
     return scene;
   }

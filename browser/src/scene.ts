@@ -4,7 +4,7 @@ import type { components } from "./generated/openapi.js";
 import type { Pose } from "./pose.js";
 import { Arrival } from "./arrival.js";
 import type { Extent } from "./library.js";
-import type { Answer, Request } from "./worker.js";
+import type { Answer, Drawn, Loaded, RendererChoice, RendererName, Request } from "./worker.js";
 
 type Schemas = components["schemas"];
 
@@ -75,6 +75,8 @@ export interface Scene {
   readonly info: SceneInfo;
   /** When frames are those of the whole file. Rejects, in a sentence, where the rest of it is damaged, or does not come. */
   readonly whole: Promise<void>;
+  /** What drew the newest frame, or will draw the first. */
+  readonly renderer: RendererName | "service";
   /** The frame of a pose. Throws, in a sentence, for a pose or settings that cannot be. */
   render(pose: Pose, settings?: Settings): Promise<Frame>;
   close(): void;
@@ -89,6 +91,7 @@ export interface SceneInfo {
   [name: string]: unknown;
 }
 
+const RENDERERS: RendererChoice[] = ["auto", "wasm", "webgpu"];
 const MOST_VIEWS = 4; // settings that are kept ready
 
 class LocalScene implements Scene {
@@ -96,26 +99,28 @@ class LocalScene implements Scene {
   #views = new Map<string, Promise<{ view: number; info: FrameInfo }>>();
 
   constructor(
-    private readonly renderer: Renderer,
+    private readonly worker: Renderer,
     private readonly scene: number,
     readonly info: SceneInfo,
+    public renderer: RendererName,
   ) {}
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
     const { view, info } = await this.#view(JSON.stringify(settings));
-    const frame = await this.renderer.ask<{ pixels: Uint8Array<ArrayBuffer>; figures: Float64Array }>({ act: "render", view, pose: checked(pose) });
+    const frame = await this.worker.ask<Drawn>({ act: "render", view, pose: checked(pose) });
+    this.renderer = frame.renderer;
     const figures = FIGURES.map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
     return new Frame(info, frame.pixels, Object.fromEntries(figures) as Extrapolation);
   }
 
   close(): void {
-    this.renderer.close();
+    this.worker.close();
   }
 
   #view(settings: string): Promise<{ view: number; info: FrameInfo }> {
     let kept = this.#views.get(settings);
     if (kept === undefined) {
-      kept = this.renderer
+      kept = this.worker
         .ask<{ view: number; info: string }>({ act: "prepare", scene: this.scene, settings })
         .then(({ view, info }) => ({ view, info: JSON.parse(info) as FrameInfo }));
       kept.catch(() => this.#views.delete(settings)); // the next one is told again what is wrong
@@ -125,7 +130,7 @@ class LocalScene implements Scene {
     for (const [oldest, view] of this.#views) {
       if (this.#views.size <= MOST_VIEWS) break;
       this.#views.delete(oldest);
-      void view.then(({ view }) => this.renderer.ask({ act: "freeView", view }));
+      void view.then(({ view }) => this.worker.ask({ act: "freeView", view }));
     }
     return kept;
   }
@@ -175,6 +180,7 @@ class ArrivingScene implements Scene {
     private now: Scene,
     arrival: Arrival,
     progress: (share: number) => void,
+    private readonly choice: RendererChoice,
   ) {
     this.whole = this.#refine(arrival, progress);
     this.whole.catch(() => undefined); // for those who do not ask for it
@@ -182,6 +188,10 @@ class ArrivingScene implements Scene {
 
   get info(): SceneInfo {
     return this.now.info;
+  }
+
+  get renderer(): Scene["renderer"] {
+    return this.now.renderer;
   }
 
   async render(pose: Pose, settings?: Settings): Promise<Frame> {
@@ -202,7 +212,7 @@ class ArrivingScene implements Scene {
   async #refine(arrival: Arrival, progress: (share: number) => void): Promise<void> {
     progress(arrival.share);
     while (await arrival.more()) {
-      const finer = await opened(...arrival.take());
+      const finer = await opened(...arrival.take(), this.choice);
       if (this.#closed) return finer.close();
       const coarser = this.now;
       this.now = finer;
@@ -216,6 +226,7 @@ type Waiting = { resolve: (frame: Frame) => void; reject: (error: Error) => void
 
 class ServedScene implements Scene {
   readonly whole = Promise.resolve();
+  readonly renderer = "service";
   #socket: Promise<WebSocket> | undefined;
   #sequence = 0;
   #waiting = new Map<number, Waiting>();
@@ -288,17 +299,22 @@ function checked(pose: Pose): number[] {
   return [...pose];
 }
 
-async function opened(bytes: Uint8Array, extent: Extent): Promise<Scene> {
-  const renderer = new Renderer();
+async function opened(bytes: Uint8Array, extent: Extent, renderer: RendererChoice): Promise<Scene> {
+  const worker = new Renderer();
   try {
-    const { scene, info } = await renderer.ask<{ scene: number; info: string }>({ act: "load", bytes, extent });
-    const told = JSON.parse(info) as SceneInfo;
+    const loaded = await worker.ask<Loaded>({ act: "load", bytes, extent, renderer });
+    const told = JSON.parse(loaded.info) as SceneInfo;
     told.label_names ??= {}; // a file without labels says nothing of them
-    return new LocalScene(renderer, scene, told);
+    return new LocalScene(worker, loaded.scene, told, loaded.renderer);
   } catch (error) {
-    renderer.close();
+    worker.close();
     throw error;
   }
+}
+
+export interface LoadOptions {
+  progress?: (share: number) => void;
+  renderer?: RendererChoice;
 }
 
 export const Scene = {
@@ -306,15 +322,19 @@ export const Scene = {
    *
    * A compressed file (.ugz) is a scene as soon as its first part is there, and becomes finer as the others arrive:
    * `progress` is then called with the share of the file that frames show.
+   *
+   * `renderer`: what draws, WebAssembly or WebGPU; `auto`, WebGPU where the browser has a GPU that suffices for the scene.
+   * A device that is lost leaves its frames to WebAssembly.
    */
-  async load(source: string | URL | Uint8Array, { progress = () => undefined }: { progress?: (share: number) => void } = {}): Promise<Scene> {
-    if (source instanceof Uint8Array) return opened(source, "whole");
+  async load(source: string | URL | Uint8Array, { progress = () => undefined, renderer = "auto" }: LoadOptions = {}): Promise<Scene> {
+    if (!RENDERERS.includes(renderer)) throw new Error(`renderer must be one of ${RENDERERS.join(", ")}, got ${renderer}`);
+    if (source instanceof Uint8Array) return opened(source, "whole", renderer);
     const answer = await fetch(source);
     if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
     const arrival = new Arrival(answer.body!);
     await arrival.more();
-    const scene = await opened(...arrival.take());
-    return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress) : scene;
+    const scene = await opened(...arrival.take(), renderer);
+    return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress, renderer) : scene;
   },
 
   /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed. */

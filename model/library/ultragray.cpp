@@ -73,9 +73,11 @@ int ultragray_render(const ultragray_view* view, const double* poses, size_t cou
     });
 }
 
-const float* ultragray_gaussians(const ultragray_scene* scene) {
+const float* ultragray_gaussians(const ultragray_scene* scene, size_t* count) {
     static_assert(sizeof(ultragray::Gaussian) == 12 * sizeof(float), "the header says so");
-    return reinterpret_cast<const float*>(scene->scene->scene.gaussians->view().gaussians);
+    const ultragray::SceneView view = scene->scene->scene.gaussians->view();
+    *count = size_t(view.count);
+    return reinterpret_cast<const float*>(view.gaussians);
 }
 
 const float* ultragray_harmonics(const ultragray_scene* scene) { return scene->scene->scene.gaussians->view().sh; }

@@ -60,11 +60,11 @@ ULTRAGRAY_API int ultragray_render(const ultragray_view *view, const double *pos
 
 /* For renderers that draw planes themselves, such as a GPU's: what ultragray_render draws by, and the rest of a frame. */
 
-/* The scene's Gaussians [N, 12] along a space-filling curve: mean (cm, about the scene's centre), standard deviations (cm),
- * unit quaternion (w, x, y, z), 1 - transmittance, and the distance (cm) beyond which it has no weight. N and the degree of
- * its harmonics stand in the scene's description. As long as the scene is there. */
-ULTRAGRAY_API const float *ultragray_gaussians(const ultragray_scene *scene);
-/* Their spherical harmonics [N, (degree + 1)^2]. */
+/* The scene's Gaussians [count, 12] along a space-filling curve: mean (cm, about the scene's centre), standard deviations
+ * (cm), unit quaternion (w, x, y, z), 1 - transmittance, and the distance (cm) beyond which it has no weight. As long as the
+ * scene is there. */
+ULTRAGRAY_API const float *ultragray_gaussians(const ultragray_scene *scene, size_t *count);
+/* Their spherical harmonics [count, (degree + 1)^2], of the degree that the scene's description tells. */
 ULTRAGRAY_API const float *ultragray_harmonics(const ultragray_scene *scene);
 
 /* A pose in the terms of docs/physics.md, section 3, about the scene's centre. Booleans are 0 or 1. */

@@ -11,7 +11,7 @@ import { tmpdir } from "node:os";
 import path from "node:path";
 import { gzipSync } from "node:zlib";
 
-import { launch, PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
+import { launch, launchWithGpu, PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
 
 const SIZES = [512, 384];
 const FRAMES = 60; // of each size
@@ -27,15 +27,15 @@ const rounded = (value) => Math.round(value * 100) / 100;
 const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
 
 /** Milliseconds of each frame along the sweep, one after another. */
-async function rendered_ms({ side, frames }) {
+async function rendered_ms({ side, frames, renderer = "wasm", before = 5 }) {
   const { poses } = await (await fetch("page.json")).json();
-  globalThis.scene ??= await (await import("./index.js")).Scene.load("scene.ugz");
+  globalThis.scene ??= await (await import("./index.js")).Scene.load("scene.ugz", { renderer });
   await globalThis.scene.whole;
   const found = [];
-  for (let k = -5; k < frames; k++) {
-    const before = performance.now();
-    await globalThis.scene.render(poses[(k + 5) % poses.length], { height: side, width: side });
-    if (k >= 0) found.push(performance.now() - before);
+  for (let k = -before; k < frames; k++) {
+    const begin = performance.now();
+    await globalThis.scene.render(poses[(k + before) % poses.length], { height: side, width: side });
+    if (k >= 0) found.push(performance.now() - begin);
   }
   return found;
 }
@@ -70,6 +70,17 @@ try {
     const [here, native] = [median(times[side].browser), median(times[side].native)];
     return { side, browser_ms: rounded(here), native_ms: rounded(native), ratio: rounded(here / native), frames_per_s: rounded(1000 / here) };
   });
+  const gpu = await launchWithGpu(url);
+  let webgpu;
+  if (gpu.browser) {
+    const { name, software } = gpu.adapter;
+    const drawing = await gpu.browser.newPage();
+    await drawing.goto(url);
+    const [side] = SIZES;
+    const ms = median(await drawing.evaluate(rendered_ms, { side, renderer: "webgpu", ...(software ? { frames: 3, before: 1 } : { frames: FRAMES }) }));
+    webgpu = { adapter: software ? `${name}, in software` : name, side, ms: rounded(ms), frames_per_s: rounded(1000 / ms) };
+    await gpu.browser.close();
+  }
   const session = await browser.newBrowserCDPSession();
   /** What the page's process has in memory, its worker with the scene among it. */
   const memory_mib = async () => {
@@ -85,10 +96,11 @@ try {
     await page.evaluate(rendered_ms, { side: 256, frames: SAMPLE_S * 30 });
     memory.push(await memory_mib());
   }
-  const files = readdirSync(site).filter((name) => /\.(js|wasm|html|css)$/.test(name));
+  const files = readdirSync(site, { recursive: true }).filter((name) => /\.(js|wasm|html|css)$/.test(name));
   const figures = {
     measured: JSON.parse(python("-m", "ultragray_studies.bench.report")),
     sizes,
+    ...(webgpu && { webgpu }),
     first_frame_ms: rounded(first_ms),
     frames_for_growth: Math.ceil(seconds / SAMPLE_S) * SAMPLE_S * 30,
     memory_mib: { first: memory[0], last: memory.at(-1), most: Math.max(...memory) },

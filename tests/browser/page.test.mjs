@@ -1,79 +1,28 @@
 /** The exported page, handed out by Python's http.server, in Chromium and Firefox: it renders every frame itself. */
 
 import assert from "node:assert/strict";
-import { execFileSync, spawn } from "node:child_process";
 import { once } from "node:events";
 import http from "node:http";
-import { mkdtempSync, readFileSync, rmSync } from "node:fs";
-import { tmpdir } from "node:os";
+import { readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 
 import { launchFirefox, missing } from "../console/firefox.mjs";
-import { PYTHON, ROOT, Service, SOURCES, TIMEOUT_MS, launch, seriousFindings } from "../console/harness.mjs";
+import { Service, TIMEOUT_MS, launch, seriousFindings } from "../console/harness.mjs";
+import { check, differences, MOST, openSite } from "./site.mjs";
 
-const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
-const SEED = 7;
-const MOST = 5e-4; // of a value's difference from the reference
-const MOST_AT_THRESHOLDS = 1 / 255; // where a Gaussian just reaches so much for one of the two, as with the native kernels
-const MOST_FLIPS = 1e-4; // share of such values
-
-const folder = mkdtempSync(path.join(tmpdir(), "ultragray-page-"));
-const site = path.join(folder, "page");
-let server, url, browser;
+let site, url, browser;
 
 before(async () => {
-  execFileSync(PYTHON, [path.join(ROOT, "tests/browser/make_frames.py"), site, String(FRAMES), String(SEED)], {
-    env: { ...process.env, PYTHONPATH: SOURCES, OMP_NUM_THREADS: "1" },
-    stdio: ["ignore", "inherit", "inherit"],
-  });
-  server = spawn(PYTHON, ["-u", "-m", "http.server", "--bind", "127.0.0.1", "--directory", site, "0"], { stdio: ["ignore", "pipe", "ignore"] });
-  const [line] = await once(server.stdout, "data");
-  url = /http:\/\/[^/]+\//.exec(String(line))[0];
+  site = await openSite();
+  url = site.url;
   browser = await launch();
 });
 
 after(async () => {
   await browser?.close();
-  server?.kill();
-  rmSync(folder, { recursive: true, force: true });
+  site?.close();
 });
-
-/** Renders all requests in a page, and compares the values, before display settings enlarge a difference. */
-async function differences(MOST) {
-  const { Scene } = await import("./index.js");
-  const [requests, expected] = await Promise.all([
-    fetch("requests.json").then((answer) => answer.json()),
-    fetch("expected.bin").then((answer) => answer.arrayBuffer()),
-  ]);
-  const scene = await Scene.load("scene.ugz");
-  await scene.whole;
-  let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
-  for (const { pose, settings, enlarged } of requests) {
-    const frame = await scene.render(pose, settings);
-    frames += 1;
-    for (const output of frame.info.outputs) {
-      const pixels = frame.pixels(output);
-      const wanted = new Float32Array(expected, at, pixels.length);
-      at += 4 * pixels.length;
-      values += pixels.length;
-      for (let k = 0; k < pixels.length; k++) {
-        const apart = Math.abs(pixels[k] - wanted[k]) / enlarged;
-        flips += apart > MOST;
-        largest = Math.max(largest, apart);
-      }
-    }
-  }
-  scene.close();
-  return { frames, values, flips, largest, left: expected.byteLength - at };
-}
-
-function check({ frames, values, flips, largest, left }) {
-  assert.equal(left, 0);
-  assert.equal(frames, FRAMES);
-  assert.ok(flips <= MOST_FLIPS * values, `${flips} of ${values} values differ by more than ${MOST}`);
-  assert.ok(largest <= MOST_AT_THRESHOLDS, `a value differs by ${largest}`);
-}
 
 async function shown(page) {
   await page.waitForFunction(() => /pixels/.test(document.querySelector("#status").value), null, { timeout: TIMEOUT_MS });
@@ -88,7 +37,7 @@ async function shown(page) {
 test("random frames in Chromium are those of the reference", async () => {
   const page = await browser.newPage();
   await page.goto(url);
-  check(await page.evaluate(differences, MOST));
+  check(await page.evaluate(differences, { MOST, renderer: "wasm" }));
   await page.close();
 });
 
@@ -98,7 +47,7 @@ test("random frames in Firefox are those of the reference", { skip: missing ?? f
     const page = await firefox.newPage();
     page.setDefaultTimeout(TIMEOUT_MS);
     await page.goto(url);
-    check(await page.evaluate(differences, MOST));
+    check(await page.evaluate(differences, { MOST, renderer: "wasm" }));
   } finally {
     await firefox.close();
   }
@@ -169,7 +118,7 @@ test("what is wrong is said in a sentence", async () => {
 
 /** Hands out the site, and of slow.ugz its beginning at once, the rest after a request for /rest; cut.ugz and damaged.ugz are what they are called. */
 async function slowServer() {
-  const whole = readFileSync(path.join(site, "scene.ugz"));
+  const whole = readFileSync(path.join(site.folder, "scene.ugz"));
   const damaged = Buffer.from(whole);
   damaged[whole.length - 100] ^= 1;
   const beginning = Math.floor(whole.length / 2); // within the third of four parts
@@ -181,7 +130,7 @@ async function slowServer() {
     if (name === "slow.ugz") (hold = response).writeHead(200).write(whole.subarray(0, beginning));
     else if (name === "cut.ugz") response.end(whole.subarray(0, beginning));
     else if (name === "damaged.ugz") response.end(damaged);
-    else response.writeHead(200, { "Content-Type": types[name.split(".").at(-1)] ?? "text/plain" }).end(name === "rest" ? "" : readFileSync(path.join(site, name)));
+    else response.writeHead(200, { "Content-Type": types[name.split(".").at(-1)] ?? "text/plain" }).end(name === "rest" ? "" : readFileSync(path.join(site.folder, name)));
   });
   slow.listen(0, "127.0.0.1");
   await once(slow, "listening");
@@ -273,9 +222,9 @@ test("a scene of a service is rendered behind the same interface", async () => {
     const page = await context.newPage();
     const types = { js: "text/javascript", ugr: "application/octet-stream", wasm: "application/wasm", json: "application/json" };
     // As if the service handed out the package: a page of another site may not ask it.
-    await page.route(`${service.url}/package/*`, (route) => {
-      const name = route.request().url().split("/").at(-1);
-      return route.fulfill({ body: readFileSync(path.join(site, name)), contentType: types[name.split(".").at(-1)] });
+    await page.route(`${service.url}/package/**`, (route) => {
+      const name = route.request().url().split("/package/")[1];
+      return route.fulfill({ body: readFileSync(path.join(site.folder, name)), contentType: types[name.split(".").at(-1)] });
     });
     await page.goto(`${service.url}/healthz`);
     const apart = await page.evaluate(async () => {

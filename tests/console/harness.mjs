@@ -96,8 +96,26 @@ export class Service {
   }
 }
 
-export function launch() {
-  return chromium.launch({ executablePath: CHROMIUM, args: CHROMIUM_FLAGS, timeout: TIMEOUT_MS });
+export function launch(flags = CHROMIUM_FLAGS) {
+  return chromium.launch({ executablePath: CHROMIUM, args: flags, timeout: TIMEOUT_MS });
+}
+
+/** A Chromium whose pages have WebGPU, and its adapter's name: that of this machine's GPU, else of software. */
+export async function launchWithGpu(url) {
+  const flags = [...CHROMIUM_FLAGS.filter((flag) => flag !== "--disable-gpu"), "--enable-unsafe-webgpu"];
+  for (const kind of ["--enable-features=Vulkan", "--use-webgpu-adapter=swiftshader"]) {
+    const browser = await launch([...flags, kind]);
+    const page = await browser.newPage();
+    await page.goto(url); // only pages of secure origins have WebGPU
+    const adapter = await page.evaluate(async () => {
+      const info = (await navigator.gpu?.requestAdapter())?.info;
+      return info && { name: [info.vendor, info.architecture, info.description].filter(Boolean).join(" "), software: info.isFallbackAdapter };
+    });
+    await page.close();
+    if (adapter) return { browser, adapter };
+    await browser.close();
+  }
+  return {};
 }
 
 /** A page that remembers what went wrong in it: `page.faults` (errors, refused sources) and `page.foreign` (requests elsewhere).

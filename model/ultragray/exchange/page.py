@@ -38,18 +38,17 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
     made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         made.chmod(0o755)
-        for asset in ASSETS.iterdir():
-            shutil.copyfile(asset, made / asset.name)
+        shutil.copytree(ASSETS, made, dirs_exist_ok=True, copy_function=shutil.copyfile)
         _write_compressed(header, scene, made / "scene.ugz")
         (made / "page.json").write_text(json.dumps(_described(header, scene.stem)), encoding="utf-8")
-        for path in made.iterdir():
+        for path in made.rglob("*"):
             sync(path)
         os.replace(made, folder)
         sync(folder.parent)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
-    return sorted(folder.iterdir())
+    return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
 def _write_compressed(header: SceneHeader, scene: Path, path: Path) -> None:

@@ -16,7 +16,8 @@ def built(tmp_path, monkeypatch):
     """Assets as `make browser` leaves them, by name: what is in them does not matter here."""
     assets = tmp_path / "assets"
     assets.mkdir()
-    for name in ("index.html", "ultragray.wasm"):
+    (assets / "gpu").mkdir()
+    for name in ("gpu/renderer.js", "index.html", "ultragray.wasm"):
         (assets / name).write_text(name)
     monkeypatch.setattr(page, "ASSETS", assets)
     return tmp_path
@@ -24,7 +25,8 @@ def built(tmp_path, monkeypatch):
 
 def test_a_page_holds_renderer_scene_and_poses(built):
     files = page.write_page(DEMO_FILE, built / "made" / "page")
-    assert [path.name for path in files] == ["index.html", "page.json", "scene.ugz", "ultragray.wasm"]
+    names = [str(path.relative_to(built / "made" / "page")) for path in files]
+    assert names == ["gpu/renderer.js", "index.html", "page.json", "scene.ugz", "ultragray.wasm"]
     scene = built / "made" / "page" / "scene.ugz"
     assert read_header(scene).is_compressed
     page.write_page(scene, built / "again")

@@ -118,7 +118,7 @@ def library():
         ("frame_bytes", size, (pointer,)),
         ("free_view", None, (pointer,)),
         ("render", ctypes.c_int, (pointer, pointer, size, ctypes.c_int, pointer, pointer)),
-        ("gaussians", ctypes.POINTER(ctypes.c_float), (pointer,)),
+        ("gaussians", ctypes.POINTER(ctypes.c_float), (pointer, ctypes.POINTER(size))),
         ("harmonics", ctypes.POINTER(ctypes.c_float), (pointer,)),
         ("plan_of", ctypes.c_int, (pointer, pointer, ctypes.POINTER(Plan))),
         ("finish", ctypes.c_int, (pointer, pointer, pointer, ctypes.c_int, pointer, pointer)),
@@ -277,7 +277,9 @@ def test_the_geometry_of_a_plan_is_the_pose_and_the_probe(scene, python_scene):
 
 def test_gaussians_are_those_of_the_scene(scene, python_scene):
     count, terms = len(python_scene.means), python_scene.shN.shape[1] + 1
-    gaussians = np.ctypeslib.as_array(scene.library.ultragray_gaussians(scene.pointer), (count, 12))
+    found = ctypes.c_size_t()
+    gaussians = np.ctypeslib.as_array(scene.library.ultragray_gaussians(scene.pointer, found), (count, 12))
+    assert found.value == count
     harmonics = np.ctypeslib.as_array(scene.library.ultragray_harmonics(scene.pointer), (count, terms))
     means = python_scene.means.numpy()
     order, given = np.lexsort(gaussians[:, :3].T), np.lexsort(means.T)

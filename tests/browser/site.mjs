@@ -1,0 +1,68 @@
+/** The exported page of the demo scene with random frames as the reference renders them, handed out by Python's http.server. */
+
+import assert from "node:assert/strict";
+import { execFileSync, spawn } from "node:child_process";
+import { once } from "node:events";
+import { mkdtempSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import path from "node:path";
+
+import { PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
+
+const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
+const SEED = 7;
+export const MOST = 5e-4; // of a value's difference from the reference
+const MOST_AT_THRESHOLDS = 1 / 255; // where a Gaussian just reaches so much for one of the two, as with the native kernels
+const MOST_FLIPS = 1e-4; // share of such values
+
+export async function openSite() {
+  const root = mkdtempSync(path.join(tmpdir(), "ultragray-page-"));
+  const folder = path.join(root, "page");
+  execFileSync(PYTHON, [path.join(ROOT, "tests/browser/make_frames.py"), folder, String(FRAMES), String(SEED)], {
+    env: { ...process.env, PYTHONPATH: SOURCES, OMP_NUM_THREADS: "1" },
+    stdio: ["ignore", "inherit", "inherit"],
+  });
+  const server = spawn(PYTHON, ["-u", "-m", "http.server", "--bind", "127.0.0.1", "--directory", folder, "0"], { stdio: ["ignore", "pipe", "ignore"] });
+  const [line] = await once(server.stdout, "data");
+  const close = () => {
+    server.kill();
+    rmSync(root, { recursive: true, force: true });
+  };
+  return { folder, url: /http:\/\/[^/]+\//.exec(String(line))[0], close };
+}
+
+/** Renders all requests in a page, and compares the values, before display settings enlarge a difference. */
+export async function differences({ MOST, renderer }) {
+  const { Scene } = await import("./index.js");
+  const [requests, expected] = await Promise.all([
+    fetch("requests.json").then((answer) => answer.json()),
+    fetch("expected.bin").then((answer) => answer.arrayBuffer()),
+  ]);
+  const scene = await Scene.load("scene.ugz", { renderer });
+  await scene.whole;
+  let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
+  for (const { pose, settings, enlarged } of requests) {
+    const frame = await scene.render(pose, settings);
+    frames += scene.renderer === renderer;
+    for (const output of frame.info.outputs) {
+      const pixels = frame.pixels(output);
+      const wanted = new Float32Array(expected, at, pixels.length);
+      at += 4 * pixels.length;
+      values += pixels.length;
+      for (let k = 0; k < pixels.length; k++) {
+        const apart = Math.abs(pixels[k] - wanted[k]) / enlarged;
+        flips += apart > MOST;
+        largest = Math.max(largest, apart);
+      }
+    }
+  }
+  scene.close();
+  return { frames, values, flips, largest, left: expected.byteLength - at };
+}
+
+export function check({ frames, values, flips, largest, left }) {
+  assert.equal(left, 0);
+  assert.equal(frames, FRAMES);
+  assert.ok(flips <= MOST_FLIPS * values, `${flips} of ${values} values differ by more than ${MOST}`);
+  assert.ok(largest <= MOST_AT_THRESHOLDS, `a value differs by ${largest}`);
+}
