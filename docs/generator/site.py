@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+from ultragray.exchange import page
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.display import Display
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
@@ -28,7 +30,18 @@ from . import interfaces, product, python_api
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "build"
 CONFIGURATION = Path(__file__).with_name("zensical.toml")
+DEMO = "demo"  # the folder of the demo scene's page in the site
+
+
+def demo_page() -> str:
+    """A link for documents in a folder of docs/; the page is no document, whose links would be checked."""
+    if page.is_built():
+        return f'<a href="../../{DEMO}/index.html">The demo scene, rendered by your browser</a>'
+    return "*(This site was built without `make browser` before, so that the demo scene's page is not part of it.)*"
+
+
 PARTS: dict[str, Callable[[], str]] = {
+    "demo page": demo_page,
     "outputs": product.outputs,
     "formats": product.formats,
     "npz": product.npz,
@@ -159,4 +172,6 @@ def build(folder: Path = FOLDER) -> Path:
         raise SiteInvalid(f"{', '.join(sorted(lost))}: in no section of {CONFIGURATION.name}")
     (folder / CONFIGURATION.name).write_text(configuration, encoding="utf-8")
     subprocess.run([sys.executable, "-m", "zensical", "build", "--strict"], cwd=folder, check=True)
+    if page.is_built():
+        page.write_page(DEMO_FILE, site / DEMO)
     return site

@@ -21,6 +21,11 @@ ASSETS = Path(__file__).with_name("page")
 MAX_POSES = 240  # of the sweep: steps of its slider
 
 
+def is_built() -> bool:
+    """Whether `make browser` was run."""
+    return (ASSETS / "ultragray.wasm").is_file()
+
+
 def write_page(scene: Path, folder: Path) -> list[Path]:
     """Writes the page of a scene file into a folder that is not there, or empty: whole or not at all.
 
@@ -30,7 +35,7 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
     header = read_header(scene)
     if header.info.probe is None or not len(header.training_poses):
         raise InvalidArgument("a page needs a scene that knows its probe and its training poses", field="scene")
-    if not (ASSETS / "ultragray.wasm").is_file():
+    if not is_built():
         raise BackendUnavailable("the page is not built: run `make browser` in a checkout (needs Debian's emscripten)")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InvalidArgument(f"{folder} must be a new folder, or an empty one", field="page")

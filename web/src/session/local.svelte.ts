@@ -15,7 +15,6 @@ const STORAGE = "ultragray.frames";
 const PACKAGE = "/package/index.js"; // @ultragray/web, as the service hands it out
 const MOST_BYTES = 512e6; // of a scene file: the renderer has 4 GiB of memory at most
 const PAGE = "page"; // in place of a kind of renderer in the header of a frame
-const UNKNOWN = { distance_mm: null, angle_deg: null, confidence: null, supported_share: null, contact_share: null };
 
 /** What is used of the package. */
 interface Package {
@@ -28,6 +27,7 @@ interface PackageScene {
 interface PackageFrame {
   info: Pick<FrameHeader, "outputs" | "encoding" | "height" | "width" | "picture">;
   bytes: Uint8Array<ArrayBuffer>;
+  extrapolation: FrameHeader["extrapolation"];
 }
 
 /** Where frames come from, as the browser remembers it. */
@@ -118,9 +118,9 @@ export class LocalFrames {
       try {
         const { scene, sha256 } = await openedOf(this.scene);
         const begun_ms = performance.now();
-        const { info, bytes } = await scene.render(pose, settings);
+        const { info, bytes, extrapolation } = await scene.render(pose, settings);
         const came_ms = performance.now();
-        const header = { ...this.#told(settings), ...info, scene_sha256: sha256, pose: rowsOf(pose), render_ms: came_ms - begun_ms } as FrameHeader;
+        const header = { ...this.#told(settings), ...info, extrapolation, scene_sha256: sha256, pose: rowsOf(pose), render_ms: came_ms - begun_ms } as FrameHeader;
         this.take({ header, pixels: bytes, asked: JSON.stringify(settings), roundTrip_ms: came_ms - begun_ms, came_ms });
         this.problem = null;
         this.ready = true;
@@ -144,7 +144,6 @@ export class LocalFrames {
       tools: settings.tools ?? [],
       scene: name,
       renderer: PAGE,
-      extrapolation: UNKNOWN,
       sequence: 0,
       client_time_ms: null,
       dropped: 0,
