@@ -65,8 +65,9 @@ test-notebooks: $(VENV)/installed-dev  ## run every notebook of examples/noteboo
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr; mono-mcs mono-runtime libmono-system-net-http4.0-cil for the example in C#) against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
 
-test-browser: $(VENV)/installed-dev $(BROWSER) web/node_modules/.package-lock.json  ## frames that Debian's Chromium and Firefox render themselves, against the library's
-	node --test --test-concurrency=1 tests/browser/*.test.mjs
+test-browser: FRAMES = 60
+test-browser: $(VENV)/installed-dev $(BROWSER) web/node_modules/.package-lock.json  ## FRAMES (60) random frames that Debian's Chromium and Firefox render themselves, against the library's; FRAMES=2000 loads 1,000 scenes, too
+	ULTRAGRAY_BROWSER_FRAMES=$(FRAMES) node --test --test-concurrency=1 tests/browser/*.test.mjs
 
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)

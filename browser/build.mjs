@@ -10,7 +10,8 @@ const run = (command, ...words) => execFileSync(command, words, { cwd: here(".")
 
 mkdirSync(here("src/generated"), { recursive: true });
 const document = JSON.parse(readFileSync(here("../web/openapi.json"), "utf8"));
-writeFileSync(here("src/generated/openapi.ts"), astToString(await openapiTS(document)));
+// What has a default may be left out of settings.
+writeFileSync(here("src/generated/openapi.ts"), astToString(await openapiTS(document, { defaultNonNullable: false })));
 const shader = (name) => `export const ${name} = ${JSON.stringify(readFileSync(here(`src/gpu/${name}.wgsl`), "utf8"))};\n`;
 writeFileSync(here("src/generated/shaders.ts"), ["common", "slice", "draw", "finish"].map(shader).join("")); // a page's policy fetches no text
 run(here("node_modules/.bin/tsc"));

@@ -35,7 +35,9 @@ output.addEventListener("input", take);
 probe.addEventListener("frame", (event) => {
   const { frame, pose } = (event as CustomEvent<{ frame: Frame; pose: Pose }>).detail;
   const [x, y, z] = [pose[3]!, pose[7]!, pose[11]!].map((mm) => mm.toFixed(1));
-  status.value = `x ${x}, y ${y}, z ${z} mm · ${frame.info.width}×${frame.info.height} pixels`;
+  const { confidence } = frame.extrapolation;
+  const trust = confidence === null ? "" : ` · expected similarity ${(100 * confidence).toFixed(0)} %`;
+  status.value = `x ${x}, y ${y}, z ${z} mm · ${frame.info.width}×${frame.info.height} pixels${trust}`;
 });
 probe.addEventListener("problem", (event) => (status.value = (event as CustomEvent<Error>).detail.message));
 take();

@@ -46,6 +46,7 @@ export class UltragrayProbe extends HTMLElement {
   #wanted = false;
   #drawing = false;
   #gamepad = 0;
+  #held: readonly [number, number] = [0, 0]; // where the pointer was
 
   constructor() {
     super();
@@ -55,7 +56,7 @@ export class UltragrayProbe extends HTMLElement {
     shadow.adoptedStyleSheets = [style];
     shadow.append(this.#canvas);
     this.addEventListener("keydown", (event) => this.#key(event));
-    this.addEventListener("pointerdown", (event) => this.setPointerCapture(event.pointerId));
+    this.addEventListener("pointerdown", (event) => this.#take(event));
     this.addEventListener("pointermove", (event) => this.#drag(event));
     this.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
   }
@@ -170,10 +171,17 @@ export class UltragrayProbe extends HTMLElement {
     this.move(motion);
   }
 
-  #drag(event: PointerEvent): void {
-    if (event.buttons === 0) return;
-    if (event.shiftKey || event.buttons === 2) this.move({ rock: event.movementX * DRAG, tilt: event.movementY * DRAG });
-    else this.move({ x: event.movementX * DRAG, y: -event.movementY * DRAG });
+  #take({ pointerId, isPrimary, clientX, clientY }: PointerEvent): void {
+    this.setPointerCapture(pointerId);
+    if (isPrimary) this.#held = [clientX, clientY];
+  }
+
+  #drag({ buttons, isPrimary, shiftKey, clientX, clientY }: PointerEvent): void {
+    if (buttons === 0 || !isPrimary) return;
+    const [across, down] = [DRAG * (clientX - this.#held[0]), DRAG * (clientY - this.#held[1])]; // fingers have no movementX everywhere
+    this.#held = [clientX, clientY];
+    if (shiftKey || buttons === 2) this.move({ rock: across, tilt: down });
+    else this.move({ x: across, y: -down });
   }
 
   #wheel(event: WheelEvent): void {

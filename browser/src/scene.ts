@@ -32,6 +32,12 @@ const BYTES = { uint8: 1, float32: 4, float16: 2 };
 /** A number from 0 on that has the 16 bits of IEEE 754. */
 const widened = (bits: number): number => (bits < 1024 ? bits / 2 ** 24 : 2 ** ((bits >> 10) - 25) * (1024 + (bits & 1023)));
 
+function numbers(bytes: Uint8Array, type: FrameInfo["encoding"]): Uint8Array | Float32Array {
+  if (type === "uint8") return bytes;
+  const { buffer } = bytes.slice();
+  return type === "float32" ? new Float32Array(buffer) : Float32Array.from(new Uint16Array(buffer), widened);
+}
+
 /** The pixels of one pose. */
 export class Frame {
   constructor(
@@ -39,6 +45,8 @@ export class Frame {
     /** All outputs, one after another. */
     readonly bytes: Uint8Array<ArrayBuffer>,
     readonly extrapolation: Extrapolation,
+    /** The type of labels among the bytes. */
+    private readonly labelsAs: FrameInfo["encoding"] = "uint8",
   ) {}
 
   /** One output, [height, width] row by row. Throws for one that was not asked for. */
@@ -47,12 +55,10 @@ export class Frame {
     const count = height * width;
     let at = 0;
     for (const one of outputs) {
-      const wide = one === "labels" ? 1 : BYTES[encoding];
-      const part = this.bytes.subarray(at, at + wide * count);
-      at += wide * count;
-      if (one !== output) continue;
-      if (wide === 1) return part;
-      return wide === 4 ? new Float32Array(part.slice().buffer) : Float32Array.from(new Uint16Array(part.slice().buffer), widened);
+      const type = one === "labels" ? this.labelsAs : encoding;
+      const part = this.bytes.subarray(at, at + BYTES[type] * count);
+      at += part.length;
+      if (one === output) return one === "labels" ? Uint8Array.from(numbers(part, type)) : numbers(part, type);
     }
     throw new Error(`the frame has ${outputs.join(", ")}, not ${output}`);
   }
@@ -284,7 +290,7 @@ class ServedScene implements Scene {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
     const begin = Math.ceil((4 + length) / 8) * 8;
-    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin), header.extrapolation));
+    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin), header.extrapolation, header.encoding as FrameInfo["encoding"]));
   }
 
   #settle(sequence: number): Waiting | undefined {

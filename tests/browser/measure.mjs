@@ -12,6 +12,7 @@ import path from "node:path";
 import { gzipSync } from "node:zlib";
 
 import { launch, launchWithGpu, PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
+import { Memory, watchRenderer } from "./memory.mjs";
 
 const SIZES = [512, 384];
 const FRAMES = 60; // of each size
@@ -58,6 +59,7 @@ try {
   );
   await cold.close();
   const page = await browser.newPage();
+  await watchRenderer(page);
   await page.goto(url);
   const times = Object.fromEntries(SIZES.map((side) => [side, { browser: [], native: [] }]));
   for (let round = 0; round < ROUNDS; round++) {
@@ -81,21 +83,15 @@ try {
     webgpu = { adapter: software ? `${name}, in software` : name, side, ms: rounded(ms), frames_per_s: rounded(1000 / ms) };
     await gpu.browser.close();
   }
-  const session = await browser.newBrowserCDPSession();
-  /** What the page's process has in memory, its worker with the scene among it. */
-  const memory_mib = async () => {
-    const { processInfo } = await session.send("SystemInfo.getProcessInfo");
-    const kib = processInfo
-      .filter(({ type }) => type === "renderer")
-      .map(({ id }) => Number(/VmRSS:\s+(\d+)/.exec(readFileSync(`/proc/${id}/status`, "utf8"))?.[1] ?? 0));
-    return rounded(Math.max(...kib) / 1024);
-  };
   await page.evaluate(rendered_ms, { side: 256, frames: 300 });
-  const memory = [await memory_mib()];
+  const memory = await Memory.of(browser, page);
+  const sampled = async () => ({ held: await memory.held(), renderer: await memory.renderer(), resident: await memory.resident() });
+  const samples = [await sampled()];
   for (let passed = 0; passed < seconds; passed += SAMPLE_S) {
     await page.evaluate(rendered_ms, { side: 256, frames: SAMPLE_S * 30 });
-    memory.push(await memory_mib());
+    samples.push(await sampled());
   }
+  const residents = samples.map(({ resident }) => rounded(resident));
   const files = readdirSync(site, { recursive: true }).filter((name) => /\.(js|wasm|html|css)$/.test(name));
   const figures = {
     measured: JSON.parse(python("-m", "ultragray_studies.bench.report")),
@@ -103,7 +99,9 @@ try {
     ...(webgpu && { webgpu }),
     first_frame_ms: rounded(first_ms),
     frames_for_growth: Math.ceil(seconds / SAMPLE_S) * SAMPLE_S * 30,
-    memory_mib: { first: memory[0], last: memory.at(-1), most: Math.max(...memory) },
+    memory_mib: { first: residents[0], last: residents.at(-1), most: Math.max(...residents) },
+    renderer_mib: { first: rounded(samples[0].renderer), last: rounded(samples.at(-1).renderer) },
+    held_mib: { first: rounded(samples[0].held), last: rounded(samples.at(-1).held) },
     page_gzip_kb: rounded(files.reduce((sum, name) => sum + gzipSync(readFileSync(path.join(site, name))).length, 0) / 1000),
   };
   process.stdout.write(`${JSON.stringify(figures, null, 2)}\n`);

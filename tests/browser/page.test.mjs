@@ -3,13 +3,18 @@
 import assert from "node:assert/strict";
 import { once } from "node:events";
 import http from "node:http";
-import { readFileSync } from "node:fs";
+import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 
 import { launchFirefox, missing } from "../console/firefox.mjs";
-import { Service, TIMEOUT_MS, launch, seriousFindings } from "../console/harness.mjs";
-import { check, differences, MOST, openSite } from "./site.mjs";
+import { PYTHON, ROOT, SCREENSHOTS, Service, TIMEOUT_MS, launch, seriousFindings } from "../console/harness.mjs";
+import { Memory, watchRenderer } from "./memory.mjs";
+import { check, differences, FRAMES, MOST, openSite } from "./site.mjs";
+
+const LOADS = Math.max(20, FRAMES / 2); // of scenes
+const DAMAGES = Math.max(60, FRAMES / 10); // of a scene file
+const MOST_KEPT_MIB = 48; // after many loads: a scene has more
 
 let site, url, browser;
 
@@ -23,6 +28,11 @@ after(async () => {
   await browser?.close();
   site?.close();
 });
+
+async function photograph(page, name) {
+  mkdirSync(SCREENSHOTS, { recursive: true });
+  await page.screenshot({ path: path.join(SCREENSHOTS, `${name}.png`) });
+}
 
 async function shown(page) {
   await page.waitForFunction(() => /pixels/.test(document.querySelector("#status").value), null, { timeout: TIMEOUT_MS });
@@ -77,13 +87,28 @@ test("the page goes on without a network, is steered by keys, and keeps its poli
   assert.notEqual(await shown(page), first);
   assert.deepEqual(faults, []);
   assert.deepEqual(await seriousFindings(page), []);
+  await photograph(page, "page-wide");
   await context.close();
 });
 
-test("the image is true to scale on a phone", async () => {
-  const page = await browser.newPage({ viewport: { width: 390, height: 844 } });
+test("on a phone the image is true to scale, and a finger moves the probe", async () => {
+  const page = await browser.newPage({ viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true });
   await page.goto(url);
-  await shown(page);
+  const first = await shown(page);
+  assert.match(await page.locator("#status").innerText(), /expected similarity \d+ %/);
+  const session = await page.context().newCDPSession(page);
+  const touch = (type, ...touchPoints) => session.send("Input.dispatchTouchEvent", { type, touchPoints });
+  const pose = () => page.evaluate(() => [3, 7, 11].map((at) => document.querySelector("ultragray-probe").pose[at]));
+  const before = await pose();
+  await touch("touchStart", { x: 150, y: 250 });
+  await touch("touchMove", { x: 170, y: 250 });
+  await touch("touchMove", { x: 190, y: 250 });
+  await touch("touchEnd");
+  const way = (await pose()).map((mm, at) => mm - before[at]);
+  assert.ok(Math.abs(Math.hypot(...way) - 4) < 0.01, `the probe went ${way} mm`);
+  await page.waitForFunction((mm) => document.querySelector("#status").value.includes(`x ${mm},`), (await pose())[0].toFixed(1), { timeout: TIMEOUT_MS });
+  assert.notEqual(await shown(page), first);
+  await photograph(page, "page-phone");
   const { width, height, wide } = await page.evaluate(() => {
     const { width, height } = document.querySelector("ultragray-probe").shadowRoot.querySelector("canvas").getBoundingClientRect();
     return { width, height, wide: document.documentElement.scrollWidth };
@@ -215,6 +240,106 @@ test("a page of an allowed site loads the scene of a service, compressed", async
   }
 });
 
+test("a scene file that is damaged or cut off is one error in words, and the page goes on", async () => {
+  const page = await browser.newPage();
+  await page.goto(url);
+  const { told, frames } = await page.evaluate(async (DAMAGES) => {
+    const { Scene } = await import("./index.js");
+    const bytes = new Uint8Array(await (await fetch("cloud.ugr")).arrayBuffer());
+    let seed = 1;
+    const random = (below) => (seed = (seed * 48271) % 2147483647) % below;
+    const damage = [
+      () => bytes.slice(0, random(bytes.length)),
+      () => bytes.slice(0, random(2000)),
+      () => bytes.slice(random(100)),
+      () => Uint8Array.from({ length: random(5000) }, () => random(256)),
+      () => bytes.with(random(2000), random(256)),
+      () => bytes.map((value, at) => (at > 8 && random(500) === 0 ? random(256) : value)),
+    ];
+    const [told, pose] = [[], [1, 0, 0, 0, 0, 1, 0, 19, 0, 0, 1, 0, 0, 0, 0, 1]];
+    let frames = 0;
+    for (let number = 0; number < DAMAGES; number++) {
+      try {
+        const scene = await Scene.load(damage[number % damage.length]());
+        await scene.render(pose, { height: 8, width: 8 }).finally(() => scene.close());
+        frames += 1;
+      } catch (error) {
+        told.push(error.message);
+      }
+    }
+    const scene = await Scene.load(bytes);
+    frames += (await scene.render(pose)).pixels().some((value) => value > 0) ? 1 : 0;
+    scene.close();
+    return { told, frames };
+  }, DAMAGES);
+  assert.equal(told.length + frames, DAMAGES + 1);
+  assert.ok(told.length >= DAMAGES / 2, `only ${told.length} of ${DAMAGES} were refused`);
+  const crashes = told.filter((message) => message.length < 10 || /unreachable|out of bounds|RuntimeError|undefined|table index|memory access|the renderer ended/.test(message));
+  assert.deepEqual(crashes, []);
+  await page.close();
+});
+
+test("memory comes back after many scenes, and frames take none for good", async () => {
+  const context = await browser.newContext();
+  const page = await context.newPage();
+  await watchRenderer(page);
+  await page.goto(`${url}index.js`); // a page without an element that renders
+  const memory = await Memory.of(browser, page);
+  const load = (count) =>
+    page.evaluate(async ({ count, url }) => {
+      const { Scene } = await import(`${url}index.js`);
+      const bytes = new Uint8Array(await (await fetch(`${url}demo.ugr`)).arrayBuffer());
+      const pose = [1, 0, 0, 0, 0, 1, 0, 19, 0, 0, 1, 0, 0, 0, 0, 1];
+      for (let k = 0; k < count; k++) {
+        const scene = await Scene.load(bytes);
+        await scene.render(pose, { height: 32, width: 32 });
+        scene.close();
+      }
+    }, { count, url });
+  const render = (count) =>
+    page.evaluate(async ({ count, url }) => {
+      globalThis.scene ??= await (await import(`${url}index.js`)).Scene.load(`${url}demo.ugr`);
+      for (let k = 0; k < count; k++) {
+        const pose = [1, 0, 0, 0, 0, 1, 0, 10 + (k % 20), 0, 0, 1, 0, 0, 0, 0, 1];
+        await globalThis.scene.render(pose, { height: 64 + 64 * (k % 6), width: 128 }); // of more settings than are kept ready
+      }
+    }, { count, url });
+  await load(10);
+  const [before, held] = [await memory.resident(), await memory.held()];
+  await load(LOADS);
+  const [after, heldAfter] = [await memory.resident(), await memory.held()];
+  console.log(`# ${LOADS} loads: ${before.toFixed(0)} MiB before, ${after.toFixed(0)} after; held by the page ${held.toFixed(1)}, ${heldAfter.toFixed(1)}`);
+  assert.ok(after - before < MOST_KEPT_MIB, `${before} MiB before, ${after} after`);
+  assert.ok(heldAfter - held < 1, `the page holds ${heldAfter} MiB, ${held} before`);
+  assert.equal(page.workers().length, 0);
+  await render(60);
+  const renderer = await memory.renderer();
+  await render(60);
+  assert.equal(await memory.renderer(), renderer, "the renderer's memory grows");
+  assert.ok((await memory.held()) - held < 1);
+  await context.close();
+});
+
+test("the worked example of the simulator's page scores a run", async () => {
+  const text = readFileSync(path.join(ROOT, "docs/howto/simulator.md"), "utf8");
+  writeFileSync(path.join(site.folder, "task.html"), /```html\n([^`]*<title>Find the plane.*?)```/s.exec(text)[1]);
+  const page = await browser.newPage();
+  await page.goto(`${url}task.html`);
+  await page.waitForSelector("ultragray-probe[src]");
+  await page.evaluate(() => new Promise((resolve) => document.querySelector("ultragray-probe").addEventListener("frame", resolve, { once: true })));
+  await page.focus("ultragray-probe");
+  await page.keyboard.press("f");
+  await page.keyboard.press("f");
+  for (let k = 0; k < 8; k++) await page.keyboard.press("ArrowDown");
+  await page.waitForFunction(() => document.querySelector("#told").textContent.startsWith("{"), null, { timeout: TIMEOUT_MS });
+  const score = JSON.parse(await page.locator("#told").innerText());
+  assert.equal(score.reached, true);
+  assert.ok(score.distance_mm <= 1 && score.angle_deg <= 2 && score.time_s > 0);
+  assert.ok(score.path_mm >= 3 && score.path_mm <= 4.1 && Math.abs(score.path_deg - 2) < 1e-3, JSON.stringify(score));
+  assert.ok(score.coverage > 0 && score.contact_share > 0.9 && score.reward > -1 && score.reward <= 0);
+  await page.close();
+});
+
 test("a scene of a service is rendered behind the same interface", async () => {
   const service = await Service.start();
   const context = await browser.newContext();
@@ -247,13 +372,19 @@ test("a scene of a service is rendered behind the same interface", async () => {
         [local, served].map((scene) => scene.render(poses[0], { min_confidence: 1 }).catch((error) => error.message)),
       );
       const pixels = halves.map((frame) => [...frame.pixels()]);
-      return { most, extrapolations, pixels, doubts, refused, width: again.info.width, same: local.info.image_height === served.info.image_height };
+      const mixed = { height: 40, width: 30, encoding: "float32", outputs: ["labels", "bmode"] };
+      const both = await Promise.all([local, served].map((scene) => scene.render(poses[0], mixed)));
+      const labelled = both.map((frame) => [frame.pixels("labels").constructor.name, [...frame.pixels("labels")], [...frame.pixels("bmode")]]);
+      return { labelled, most, extrapolations, pixels, doubts, refused, width: again.info.width, same: local.info.image_height === served.info.image_height };
     });
     assert.ok(apart.most <= 1, `grey values are ${apart.most} apart`);
     for (const [local, served] of apart.extrapolations)
       for (const [name, value] of Object.entries(served)) assert.ok(Math.abs(local[name] - value) < 1e-4, `${name}: ${local[name]}, ${value}`);
     assert.ok(Math.max(...apart.pixels[0].map((value, at) => Math.abs(value - apart.pixels[1][at]))) < 1e-3);
     assert.ok(apart.pixels[0].some((value) => value > 0.1 && value <= 1));
+    assert.deepEqual(apart.labelled[0].slice(0, 2), apart.labelled[1].slice(0, 2));
+    assert.ok(new Set(apart.labelled[1][1]).size > 2);
+    assert.ok(apart.labelled[0][2].every((value, at) => Math.abs(value - apart.labelled[1][2][at]) < 5e-4));
     for (const doubt of apart.doubts) assert.match(doubt, /has a confidence of 0\.\d\d, 1 is asked for: the nearest/);
     assert.match(apart.refused, /height must be/);
     assert.equal(apart.width, 80);

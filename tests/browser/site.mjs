@@ -9,7 +9,7 @@ import path from "node:path";
 
 import { PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
 
-const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
+export const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
 const SEED = 7;
 export const MOST = 5e-4; // of a value's difference from the reference
 const MOST_AT_THRESHOLDS = 1 / 255; // where a Gaussian just reaches so much for one of the two, as with the native kernels
@@ -38,12 +38,12 @@ export async function differences({ MOST, renderer }) {
     fetch("requests.json").then((answer) => answer.json()),
     fetch("expected.bin").then((answer) => answer.arrayBuffer()),
   ]);
-  const scene = await Scene.load("scene.ugz", { renderer });
-  await scene.whole;
+  const scenes = {};
+  for (const name of new Set(requests.map(({ scene }) => scene))) await (scenes[name] = await Scene.load(name, { renderer })).whole;
   let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
-  for (const { pose, settings, enlarged } of requests) {
-    const frame = await scene.render(pose, settings);
-    frames += scene.renderer === renderer;
+  for (const { scene, pose, settings, enlarged } of requests) {
+    const frame = await scenes[scene].render(pose, settings);
+    frames += scenes[scene].renderer === renderer;
     for (const output of frame.info.outputs) {
       const pixels = frame.pixels(output);
       const wanted = new Float32Array(expected, at, pixels.length);
@@ -56,7 +56,7 @@ export async function differences({ MOST, renderer }) {
       }
     }
   }
-  scene.close();
+  for (const scene of Object.values(scenes)) scene.close();
   return { frames, values, flips, largest, left: expected.byteLength - at };
 }
 

@@ -5,6 +5,7 @@ import { type Frame, FrameStream, type Refusal, type StreamSummary, WatchStream 
 import type { Pose } from "../geometry/pose";
 import { service } from "../page/service.svelte";
 import { areAlike, type Difference, differenceOf, frameSource, isLocal, LocalFrames } from "./local.svelte";
+import { keyOf } from "./scene.svelte";
 import type { Session } from "./session.svelte";
 
 const KEPT = 240; // frames
@@ -93,9 +94,9 @@ export class Following {
   shown({ header }: Frame): void {
     if (this.otherScene !== null || this.session.frozen) return;
     this.#place(header.pose.flat());
-    if (sameProbe(header.probe, this.session.probe) || this.#choosing) return;
+    if (keyOf(header.probe) === keyOf(this.session.probe) || this.#choosing) return;
     this.#choosing = true;
-    const chosen = sameProbe(header.probe, this.session.scene.own.probe) ? null : header.probe;
+    const chosen = keyOf(header.probe) === keyOf(this.session.scene.own.probe) ? null : header.probe;
     void this.session
       .chooseProbe(chosen)
       .catch(() => undefined)
@@ -122,11 +123,6 @@ export class Following {
 function isShowable({ header, pixels }: Frame): boolean {
   const bytes = header.height * header.width * header.outputs.length;
   return header.encoding === "uint8" && header.outputs.includes("bmode") && pixels.length >= bytes;
-}
-
-function sameProbe(a: object, b: object): boolean {
-  const sorted = (probe: object): string => JSON.stringify(Object.entries(probe).sort());
-  return sorted(a) === sorted(b);
 }
 
 const RATES_EVERY_MS = 500;

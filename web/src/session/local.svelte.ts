@@ -17,17 +17,13 @@ const MOST_BYTES = 512e6; // of a scene file: the renderer has 4 GiB of memory a
 const PAGE = "page"; // in place of a kind of renderer in the header of a frame
 
 /** What is used of the package. */
-interface Package {
-  Scene: { load(bytes: Uint8Array): Promise<PackageScene> };
-}
 interface PackageScene {
-  render(pose: Pose, settings: object): Promise<PackageFrame>;
+  render(pose: Pose, settings: object): Promise<{
+    info: Pick<FrameHeader, "outputs" | "encoding" | "height" | "width" | "picture">;
+    bytes: Uint8Array<ArrayBuffer>;
+    extrapolation: FrameHeader["extrapolation"];
+  }>;
   close(): void;
-}
-interface PackageFrame {
-  info: Pick<FrameHeader, "outputs" | "encoding" | "height" | "width" | "picture">;
-  bytes: Uint8Array<ArrayBuffer>;
-  extrapolation: FrameHeader["extrapolation"];
 }
 
 /** Where frames come from, as the browser remembers it. */
@@ -47,10 +43,7 @@ class Preference {
 
 export const frameSource = new Preference();
 
-interface Opened {
-  scene: PackageScene;
-  sha256: string;
-}
+type Opened = { scene: PackageScene; sha256: string };
 
 /** The scene that was opened last: it stays while other views are shown, and while the service is away. */
 let kept: { name: string; opened: Promise<Opened> } | null = null;
@@ -73,7 +66,7 @@ async function open({ name, description }: KnownScene): Promise<Opened> {
   if (bytes > MOST_BYTES) throw new Error(words.session.local.tooLarge((bytes / 1e6).toFixed(0), (MOST_BYTES / 1e6).toFixed(0)));
   const { Scene } = (await import(/* @vite-ignore */ PACKAGE).catch(() => {
     throw new Error(words.session.local.notBuilt);
-  })) as Package;
+  })) as { Scene: { load(bytes: Uint8Array): Promise<PackageScene> } };
   const file = new Uint8Array(await (await request(sceneFilePath(name))).arrayBuffer());
   // Browsers compute digests only for pages that they trust: not over plain HTTP from another machine.
   const digest = new Uint8Array((await crypto.subtle?.digest("SHA-256", file)) ?? []);
@@ -174,11 +167,6 @@ export interface Difference {
 export function differenceOf(one: Frame, other: Frame): Difference | null {
   const [here, there] = [outputPixels(one, "bmode"), outputPixels(other, "bmode")];
   if (here === undefined || here.length !== there?.length) return null;
-  let [largest, sum] = [0, 0];
-  for (const [at, value] of here.entries()) {
-    const apart = Math.abs(value - there[at]!);
-    largest = Math.max(largest, apart);
-    sum += apart;
-  }
-  return { largest, mean: sum / here.length };
+  const apart = here.map((value, at) => Math.abs(value - there[at]!));
+  return { largest: apart.reduce((most, one) => Math.max(most, one), 0), mean: apart.reduce((sum, one) => sum + one, 0) / apart.length };
 }

@@ -53,7 +53,8 @@ class Planes {
   }
 }
 
-function keyOf(probe: Probe): string {
+/** The same for probes that are the same. */
+export function keyOf(probe: Probe): string {
   return JSON.stringify(Object.entries(probe).sort());
 }
 
