@@ -181,32 +181,15 @@ void View::render(const double* poses, size_t count, int threads, void* pixels, 
         Extrapolation found{};
         if (judged) found = judged_by_pose(sight);
         Planes planes = wanted_planes(judged);
-        draw(sight, {}, threads, planes);
+        const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
+        if (at(planes.bmode) || at(planes.echo) || at(planes.transmittance) || at(planes.coverage))
+            ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
+                              {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr,
+                               nullptr, nullptr, nullptr, 0.0f},
+                              {});
         finish(sight, planes, threads, judged ? &found : nullptr, out + c * frame_bytes());
         if (extrapolations) extrapolations[c] = found;
     }
-}
-
-void View::draw(const Sight& sight, const Lines& lines, int threads, Planes& planes) const {
-    const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
-    if (!at(planes.bmode) && !at(planes.echo) && !at(planes.transmittance) && !at(planes.coverage)) return;
-    ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
-                      {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr, nullptr,
-                       nullptr, nullptr, 0.0f},
-                      {}, lines);
-}
-
-void View::draw(const double* pose, int first_line, int end_line, int threads, float* drawn) const {
-    const bool ends_a_strip = end_line % kStripLines == 0 || end_line == width_;
-    if (first_line < 0 || first_line % kStripLines != 0 || !ends_a_strip || first_line >= end_line || end_line > width_)
-        throw Fault("scan lines must be some of " + std::to_string(width_) + ", from one multiple of " +
-                    std::to_string(kStripLines) + " to another or to the last, got " + std::to_string(first_line) + " to " +
-                    std::to_string(end_line));
-    Planes planes = wanted_planes(true);
-    draw(sight_of(Pose::read(pose, "pose"), "pose"), {first_line, end_line}, threads, planes);
-    for (const std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage})
-        for (size_t at = first_line; at < plane->size(); at += width_)
-            drawn = std::copy_n(&(*plane)[at], end_line - first_line, drawn);
 }
 
 ultragray_plan View::plan(const double* pose) const {
@@ -257,11 +240,8 @@ Sight View::sight_of(const Pose& pose, const std::string& name) const {
     // By way of the kernels' own frame, cm about the scene's centre, as Python goes it: so that nothing is rounded
     // otherwise.
     Pose inside = sight.at_rest;
-    const Vector motion = inside.turned({motion_mm[0] / 10.0, motion_mm[1] / 10.0, motion_mm[2] / 10.0});
-    for (int d = 0; d < 3; ++d) {
-        inside.origin[d] = (inside.origin[d] - centre[d]) / 10.0 + motion[d];
-        sight.at_rest.origin[d] = 10.0 * inside.origin[d] + centre[d];
-    }
+    inside.origin = plus(times(minus(inside.origin, centre), 1.0 / 10.0), inside.turned(times(motion_mm, 1.0 / 10.0)));
+    sight.at_rest.origin = plus(times(inside.origin, 10.0), centre);
     sight.probe.kernel_pose(inside, sight.matrix);
     sight.geometry = sight.probe.kernel(height_, beam_);
     return sight;

@@ -90,14 +90,6 @@ int ultragray_plan_of(const ultragray_view* view, const double* pose, ultragray_
     });
 }
 
-int ultragray_draw(const ultragray_view* view, const double* pose, int first, int end, int threads, float* planes) {
-    return guarded(1, [&] {
-        if (view == nullptr || pose == nullptr || planes == nullptr) throw Fault("view, pose and planes must be given");
-        view->view.draw(pose, first, end, threads < 1 ? 1 : threads, planes);
-        return 0;
-    });
-}
-
 int ultragray_finish(const ultragray_view* view, const double* pose, const float* planes, int threads, void* pixels,
                      ultragray_extrapolation* extrapolation) {
     return guarded(1, [&] {
