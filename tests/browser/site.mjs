@@ -12,7 +12,9 @@ import { PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
 export const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
 const SEED = 7;
 export const MOST = 5e-4; // of a value's difference from the reference
-const MOST_AT_THRESHOLDS = 1 / 255; // where a Gaussian just reaches so much for one of the two, as with the native kernels
+// Where a Gaussian just reaches so much for one of the two, as with the native kernels; and where a point that speckle is
+// drawn from lies just in one of its cells for one, in the next for the other: a millionth of a mm moves it there.
+const MOST_AT_THRESHOLDS = { off: 1 / 255, natural: 0.1 };
 const MOST_FLIPS = 1e-4; // share of such values
 
 export async function openSite() {
@@ -40,10 +42,12 @@ export async function differences({ MOST, renderer }) {
   ]);
   const scenes = {};
   for (const name of new Set(requests.map(({ scene }) => scene))) await (scenes[name] = await Scene.load(name, { renderer })).whole;
-  let [at, values, flips, largest, frames] = [0, 0, 0, 0, 0];
+  let [at, values, flips, frames] = [0, 0, 0, 0];
+  const largest = { off: 0, natural: 0 };
   for (const { scene, pose, settings, enlarged } of requests) {
     const frame = await scenes[scene].render(pose, settings);
     frames += scenes[scene].renderer === renderer;
+    const kind = settings.speckle ?? "off";
     for (const output of frame.info.outputs) {
       const pixels = frame.pixels(output);
       const wanted = new Float32Array(expected, at, pixels.length);
@@ -52,7 +56,7 @@ export async function differences({ MOST, renderer }) {
       for (let k = 0; k < pixels.length; k++) {
         const apart = Math.abs(pixels[k] - wanted[k]) / enlarged;
         flips += apart > MOST;
-        largest = Math.max(largest, apart);
+        largest[kind] = Math.max(largest[kind], apart);
       }
     }
   }
@@ -64,5 +68,5 @@ export function check({ frames, values, flips, largest, left }) {
   assert.equal(left, 0);
   assert.equal(frames, FRAMES);
   assert.ok(flips <= MOST_FLIPS * values, `${flips} of ${values} values differ by more than ${MOST}`);
-  assert.ok(largest <= MOST_AT_THRESHOLDS, `a value differs by ${largest}`);
+  for (const [speckle, most] of Object.entries(MOST_AT_THRESHOLDS)) assert.ok(largest[speckle] <= most, `speckle ${speckle}: a value differs by ${largest[speckle]}`);
 }
