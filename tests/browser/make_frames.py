@@ -32,7 +32,7 @@ BOX = {"kind": "box", "frame": "scene", "centre_mm": [2.0, 5.0, 25.0], "size_mm"
 OUTPUTS = ("bmode", "echo", "transmittance", "attenuation", "coverage")
 
 
-def random_settings(random, name):
+def random_settings(random, *, has_speckle=True):
     settings = {"encoding": "float32", "height": int(random.integers(1, 120)), "width": int(random.integers(1, 120))}
     settings["outputs"] = [str(one) for one in random.choice(OUTPUTS, size=random.integers(1, 4), replace=False)]
     if random.random() < 0.6:
@@ -47,7 +47,7 @@ def random_settings(random, name):
         settings["ghost"] = float(random.uniform(0.1, 1.0))
     if random.random() < 0.3:
         settings["contact"] = str(random.choice(["air", "pressure"]))
-    if name != CLOUD and random.random() < 0.2:
+    if has_speckle and random.random() < 0.2:
         settings["speckle"] = "natural"
     if random.random() < 0.5:
         display = {"gain_db": float(random.uniform(-10, 10)), "dynamic_range_db": float(random.uniform(30, 90))}
@@ -119,7 +119,7 @@ def main(folder, count, seed):
             pose = scene.training_poses[random.integers(len(scene.training_poses))].copy()
             pose[:3, :3] = pose[:3, :3] @ rotations_of(0.3 * random.normal() * random_directions(random, 1))[0]
             pose[:3, 3] += random.normal(scale=5.0, size=3)
-            settings = random_settings(random, name)
+            settings = random_settings(random, has_speckle=scene.info.speckle is not None)
             asked = from_dict(RenderSettings, settings)
             resolved = asked.resolved(scene.info, asked.encoding)
             shown = render_shown(scene, resolved, pose[None], backend="reference" if number < REFERENCE else "cpu")

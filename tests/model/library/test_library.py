@@ -328,10 +328,6 @@ def random_request(random, scene):
     settings = runpy.run_path(str(BROWSER_FRAMES))["random_settings"](random)
     settings["encoding"] = str(random.choice(["uint8", "float32", "float16"]))
     settings["outputs"] += [str(one) for one in random.choice(["labels", "attenuation", "uncertainty"], size=1)]
-    if random.random() < 0.4:
-        settings["contact"] = str(random.choice(["air", "pressure"]))
-    if random.random() < 0.4:
-        settings["speckle"] = "natural"
     if random.random() < 0.3:
         settings |= {"min_confidence": float(random.uniform(0.2, 1.0)), "below_min_confidence": "mask"}
     if random.random() < 0.3 and (tools := settings.get("tools")):

@@ -117,7 +117,7 @@ WRONG = {  # the command line, and a part of the line that it gives
     "slicer scene.ugr -o a.xml": "must end in .mrml",
     "train sweep -o scene.ugr": "scene.ugr exists: --force",
     "convert sweep -o sweep": "sweep holds files",
-    "export scene.ugr -o a.stl": "output must end in .ply or .pt",
+    "export scene.ugr -o a.stl": "output must end in .ugz, .ply or .pt",
     "bench -o scene.ugr": "scene.ugr exists: --force",
     f"scenes download demo -o scene.ugr --address {NOBODY}": "scene.ugr exists: --force",
     f"scenes render demo -o a.gif --address {NOBODY}": "must end in .png, .jpg or .npz",
