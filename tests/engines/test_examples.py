@@ -115,10 +115,7 @@ def test_a_stream_in_cpp_gets_the_frames_of_the_service(stream, start_service, d
     assert ran.stdout == np.stack(frames).tobytes()
     assert ran.stderr.count(b"differs from this machine's by 0\n") == 20
     refused = subprocess.run([stream, service.grpc, "nope", "1"], capture_output=True, text=True)
-    assert (refused.returncode, refused.stderr) == (
-        1,
-        "there is no scene 'nope'; known scenes: demo, probeless, second\n",
-    )
+    assert (refused.returncode, refused.stderr.partition(";")[0]) == (1, "there is no scene 'nope'")
 
 
 def test_a_stream_in_cpp_goes_on_after_the_service_was_killed(stream, start_service):
