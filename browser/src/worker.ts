@@ -60,7 +60,7 @@ async function done(request: Request, transfer: Transferable[]): Promise<unknown
       return opened.prepare(request.scene, request.settings);
     case "render": {
       const frame = render(opened, request.view, request.pose);
-      drawn = Promise.allSettled([drawn, frame]);
+      drawn = Promise.allSettled([drawn, frame]).then(() => undefined); // else each would keep all frames before it
       transfer.push((await frame).pixels.buffer);
       return frame;
     }

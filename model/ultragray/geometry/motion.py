@@ -29,6 +29,7 @@ MAX_AHEAD_MS = 1000.0
 _POSES = 64  # that a fit looks at
 _SPANS = (1.5, 3.0, 6.0, 12.0, 24.0)  # of a fit, in steps between poses: after so many a pose weighs 1/e
 _DEGREES = (1, 2, 3)
+_ATTEMPTS = 1024  # that wait for their time: more poses than come in a second, or one that is sent again and again
 _MEMORY_S = 3.0  # after which a prediction that was tried counts 1/e
 _DOUBT = 2.0  # predictions that came to nothing, which are assumed before any was tried
 _GAP_S = 1.0  # without poses: the path begins anew
@@ -62,7 +63,7 @@ class PathPredictor:
         self._pose = np.eye(4)  # the newest
         self._times_s: deque[float] = deque(maxlen=_POSES)
         self._places: deque[FloatArray] = deque(maxlen=_POSES)  # [2, 3] each: position, and turns added up
-        self._attempts: deque[_Attempt] = deque()
+        self._attempts: deque[_Attempt] = deque(maxlen=_ATTEMPTS)
         # Over the attempts whose time has come, by fit and for position and turn: Σ m·m, Σ m·y; and Σ y·y.
         self._foretold, self._agreed = np.zeros((2, len(self._degrees), 2))
         self._moved = np.zeros(2)
