@@ -73,7 +73,8 @@ def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threa
             if known is not None and known["measured"]["commit"] == head["commit"] and not is_dirty(head):
                 continue
             log.info("%s", run)
-            write(name, {**read(staged(name)), run: {**take(given.data_folder), "measured": head}})
+            figures = {**take(given.data_folder), "measured": head}
+            write(name, {**read(staged(name)), run: figures})  # read anew: another program may have measured others
 
 
 def is_dirty(head: Document) -> bool:

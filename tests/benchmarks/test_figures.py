@@ -68,6 +68,9 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(repository, m
         taken.append(name)
         if name == "third":
             raise OSError("no room")
+        if name == "first":
+            others = figures.read(figures.staged("results_tables"))
+            measuring.write("results_tables", {**others, "of another program": {"measured": {}}})
         return {"folder": str(folder)}
 
     runs = {name: lambda folder, name=name: take(name, folder) for name in ("first", "second", "third")}
@@ -81,6 +84,7 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(repository, m
         measure()
     assert taken == ["second", "first", "third"]
     found = figures.read(figures.staged("results_tables"))
+    assert found.pop("of another program"), "measured meanwhile"
     assert {name: one["folder"] for name, one in found.items()} == dict.fromkeys(("second", "first"), str(tmp_path))
     assert found["first"]["measured"]["commit"] == repository.commit
     (repository.path / "model/code.py").write_text("second")
