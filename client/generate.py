@@ -24,6 +24,7 @@ from ultragray.exchange import ros_messages, ros_recording
 from ultragray.geometry import pose
 from ultragray.geometry.motion import Prediction
 from ultragray.geometry.probe import ElevationBeam
+from ultragray.learn.planning.settings import PlanSettings
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
@@ -40,6 +41,7 @@ ROOTS = {
     "Extrapolation": Extrapolation,
     "Prediction": Prediction,
     "SliceSettings": SliceSettings,
+    "PlanSettings": PlanSettings,
     "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,
     "Dataset": DatasetRecord,

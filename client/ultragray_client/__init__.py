@@ -13,7 +13,7 @@ from ultragray_client.connection import Tls
 from ultragray_client.contract import *  # noqa: F403
 from ultragray_client.errors import ClientError
 from ultragray_client.exchange import StreamMode
-from ultragray_client.frames import Frame, Localization, Slice, Timings
+from ultragray_client.frames import Frame, Localization, PlannedView, Slice, Timings, ViewPlan
 from ultragray_client.geometry import Picture, Placement, PoseLike, Quaternion
 from ultragray_client.holding import HoldStill
 from ultragray_client.poses import check_poses, pose_from_position_quaternion, quaternion_from_pose
@@ -56,6 +56,7 @@ __all__ = [
     "Me",
     "Picture",
     "Placement",
+    "PlannedView",
     "PoseLike",
     "Quaternion",
     "Recording",
@@ -67,6 +68,7 @@ __all__ = [
     "StreamMode",
     "Timings",
     "Tls",
+    "ViewPlan",
     "Worker",
     "WorkerDevice",
     "WorkerState",

@@ -19,6 +19,7 @@ from ultragray_client.contract import (
     Dataset,
     DatasetOptions,
     Extrapolation,
+    PlanSettings,
     Probe,
     RenderSettings,
     SliceSettings,
@@ -31,8 +32,10 @@ from ultragray_client.frames import (
     Frame,
     Localization,
     Slice,
+    ViewPlan,
     frame_from_message,
     localize_message,
+    plan_message,
     settings_message,
     slice_from_message,
 )
@@ -503,6 +506,28 @@ class _Client(Group[AnyConnection]):
         """
         request = localize_message(scene, image, start, probe, registration, within_mm, within_deg)
         return Call("RenderService.Localize", request, _one(Localization), timeout_s)
+
+    @operation
+    def plan_views(
+        self,
+        scene: str,
+        settings: PlanSettings | None = None,
+        *,
+        poses: Iterable[PoseLike] = (),
+        view: PoseLike | None = None,
+        start: PoseLike | None = None,
+        registration: str | None = None,
+        timeout_s: float | None = None,
+    ) -> Call[ViewPlan]:
+        """Where to look next: poses in reach whose frames would teach the scene most, in an order to travel them.
+
+        `poses` are all that is in reach (none: the skin under the training views, as `settings` say); `view` is a
+        standard plane: only the points of its image count; `start` is where the probe is. With a `registration` all of
+        them are poses of the flange in its base, and the planned views have such poses as well. Raises SceneNotFound,
+        InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        """
+        request = plan_message(scene, settings, poses, view, start, registration)
+        return Call("RenderService.PlanViews", request, _one(ViewPlan), timeout_s)
 
     @operation
     def who_am_i(self, *, timeout_s: float | None = None) -> Call[Me]:

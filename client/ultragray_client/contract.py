@@ -37,6 +37,7 @@ __all__ = [
     "LinearProbe",
     "Needle",
     "PhasedProbe",
+    "PlanSettings",
     "Prediction",
     "Probe",
     "RadialProbe",
@@ -333,6 +334,35 @@ class SliceSettings:
     down: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction of the columns, at a right angle.
     size_mm: tuple[float, float]  # Width and height.
     spacing_mm: float = 0.5  # Distance of two pixels.
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """Which views are looked for: what they shall gain, where, and which poses are in reach.
+
+    Without a list of poses the probe's face stays on the skin that the recorded probe faces describe, looks straight in
+    or is turned by up to `tilt_deg`, `rock_deg` and `turn_deg`, to either side each, about its lateral, elevation and
+    axial axis.
+    """
+
+    probe: Probe | None = None  # That is to scan. Default: the scene's own.
+    # What to gain. coverage: share of the points within within_mm of an image. confidence: expected MS-SSIM of
+    # frames that show them. uncertainty: of the variance of errors that views can take away, the share they do.
+    want: str = "coverage"
+    within_mm: float = 1.5  # Of coverage: how near to a point an image covers it.
+    # Only points of this box count, such as -20:20,0:30,-5:45. Default: all that poses in reach show.
+    region_mm: str | None = None
+    label: int | None = None  # Only points with this label count.
+    # Only points of a plane count: its normal n, of any length, and the distance d, n·x = d |n|, mm.
+    plane: tuple[float, float, float, float] | None = None
+    views: int = 20  # How many at most.
+    # How long the way may be at most, from view to view that of the corners of the image on average, so that a turn
+    # counts by what it moves. Default: any length.
+    path_mm: float | None = None
+    box_mm: str | None = None  # The middle of the probe's face stays in this box. Default: anywhere.
+    tilt_deg: float = 15.0  # About the lateral axis.
+    rock_deg: float = 0.0  # About the elevation axis.
+    turn_deg: float = 0.0  # About the axial axis.
 
 
 @dataclass(frozen=True)

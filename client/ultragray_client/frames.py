@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as field_of
 from enum import Enum
@@ -17,13 +17,14 @@ from ultragray_client.contract import (
     Additions,
     Encoding,
     Extrapolation,
+    PlanSettings,
     Prediction,
     Probe,
     RenderSettings,
     SettingsUsed,
 )
 from ultragray_client.errors import InvalidArgument
-from ultragray_client.geometry import FloatArray, PoseLike, pose_message
+from ultragray_client.geometry import FloatArray, PoseLike, pose_message, pose_messages
 from ultragray_client.messages import message_of
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import rendering_pb2
@@ -177,6 +178,53 @@ class Localization:
     renderer: str  # name, version and backend
     queue_ms: float
     search_ms: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedView:
+    """A view of a plan."""
+
+    pose: FloatArray  # [4, 4] mm, probe to scene
+    flange_to_base: FloatArray | None  # [4, 4] mm, the same as the pose of the registration; None: none was named
+    gain: float  # what it is expected to add to what is wanted, beside the views of lower ranks
+    rank: int  # 0: it was chosen first, as it gains most
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPlan:
+    """Where to look next. `before` and `after` are shares, 0 to 1, of confidence an MS-SSIM."""
+
+    views: tuple[PlannedView, ...]  # in an order to travel them; fewer than asked for where no other gains anything
+    before: float  # what is wanted, as the scene has it
+    after: float  # and as it is expected to be with the views
+    path_mm: float  # of the way through the views, from the start where one was given
+    registration: str | None  # that led the poses into the scene
+    scene: str
+    scene_sha256: str  # of the scene file
+    queue_ms: float
+    plan_ms: float
+
+
+def plan_message(
+    scene: str,
+    settings: PlanSettings | None,
+    poses: Iterable[PoseLike],
+    view: PoseLike | None,
+    start: PoseLike | None,
+    registration: str | None,
+) -> rendering_pb2.PlanViewsRequest:
+    """The request of a plan. Raises InvalidPose."""
+    single = {
+        name: pose_message(pose, field=name) for name, pose in (("view", view), ("start", start)) if pose is not None
+    }
+    return message_of(
+        settings or PlanSettings(),
+        rendering_pb2.PlanViewsRequest,
+        scene=scene,
+        poses=list(pose_messages(poses)),
+        **single,
+        **({} if registration is None else {"registration": registration}),
+    )
 
 
 def localize_message(

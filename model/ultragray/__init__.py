@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from ultragray.geometry.probe import SteeredProbe as SteeredProbe
     from ultragray.learn.localization.search import localize as localize
     from ultragray.learn.localization.settings import Localization as Localization
+    from ultragray.learn.planning.search import plan_views as plan_views
+    from ultragray.learn.planning.settings import PlanSettings as PlanSettings
+    from ultragray.learn.planning.settings import ViewPlan as ViewPlan
     from ultragray.rendering.frames import Frames as Frames
     from ultragray.rendering.frames import render as render
     from ultragray.scene.gaussians import GaussianScene as GaussianScene
@@ -55,6 +58,8 @@ _MODULES = {
     ),
     "learn.localization.search": ("localize",),
     "learn.localization.settings": ("Localization",),
+    "learn.planning.search": ("plan_views",),
+    "learn.planning.settings": ("PlanSettings", "ViewPlan"),
     "rendering.frames": ("Frames", "render"),
     "scene.gaussians": ("GaussianScene",),
     "scene.info": ("SceneHeader", "SceneInfo", "read_header"),

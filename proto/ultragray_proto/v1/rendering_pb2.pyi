@@ -209,6 +209,78 @@ class LocalizeResponse(_message.Message):
     registration: str
     def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., similarity: _Optional[float] = ..., is_found: _Optional[bool] = ..., position_std_mm: _Optional[_Union[AlongAxes, _Mapping]] = ..., angle_std_deg: _Optional[_Union[AlongAxes, _Mapping]] = ..., shift_mm: _Optional[float] = ..., turn_deg: _Optional[float] = ..., queue_ms: _Optional[float] = ..., search_ms: _Optional[float] = ..., flange_to_base: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., registration: _Optional[str] = ...) -> None: ...
 
+class PlanViewsRequest(_message.Message):
+    __slots__ = ("scene", "poses", "view", "start", "registration", "probe", "want", "within_mm", "region_mm", "label", "plane", "views", "path_mm", "box_mm", "tilt_deg", "rock_deg", "turn_deg")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    VIEW_FIELD_NUMBER: _ClassVar[int]
+    START_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    WANT_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
+    REGION_MM_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    PLANE_FIELD_NUMBER: _ClassVar[int]
+    VIEWS_FIELD_NUMBER: _ClassVar[int]
+    PATH_MM_FIELD_NUMBER: _ClassVar[int]
+    BOX_MM_FIELD_NUMBER: _ClassVar[int]
+    TILT_DEG_FIELD_NUMBER: _ClassVar[int]
+    ROCK_DEG_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
+    view: _geometry_pb2.Pose
+    start: _geometry_pb2.Pose
+    registration: str
+    probe: _geometry_pb2.Probe
+    want: str
+    within_mm: float
+    region_mm: str
+    label: int
+    plane: _containers.RepeatedScalarFieldContainer[float]
+    views: int
+    path_mm: float
+    box_mm: str
+    tilt_deg: float
+    rock_deg: float
+    turn_deg: float
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., view: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., registration: _Optional[str] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., want: _Optional[str] = ..., within_mm: _Optional[float] = ..., region_mm: _Optional[str] = ..., label: _Optional[int] = ..., plane: _Optional[_Iterable[float]] = ..., views: _Optional[int] = ..., path_mm: _Optional[float] = ..., box_mm: _Optional[str] = ..., tilt_deg: _Optional[float] = ..., rock_deg: _Optional[float] = ..., turn_deg: _Optional[float] = ...) -> None: ...
+
+class PlannedView(_message.Message):
+    __slots__ = ("pose", "flange_to_base", "gain", "rank")
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    FLANGE_TO_BASE_FIELD_NUMBER: _ClassVar[int]
+    GAIN_FIELD_NUMBER: _ClassVar[int]
+    RANK_FIELD_NUMBER: _ClassVar[int]
+    pose: _geometry_pb2.Matrix
+    flange_to_base: _geometry_pb2.Matrix
+    gain: float
+    rank: int
+    def __init__(self, pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., flange_to_base: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., gain: _Optional[float] = ..., rank: _Optional[int] = ...) -> None: ...
+
+class PlanViewsResponse(_message.Message):
+    __slots__ = ("scene", "scene_sha256", "views", "before", "after", "path_mm", "registration", "queue_ms", "plan_ms")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    VIEWS_FIELD_NUMBER: _ClassVar[int]
+    BEFORE_FIELD_NUMBER: _ClassVar[int]
+    AFTER_FIELD_NUMBER: _ClassVar[int]
+    PATH_MM_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_MS_FIELD_NUMBER: _ClassVar[int]
+    PLAN_MS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    scene_sha256: str
+    views: _containers.RepeatedCompositeFieldContainer[PlannedView]
+    before: float
+    after: float
+    path_mm: float
+    registration: str
+    queue_ms: float
+    plan_ms: float
+    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., views: _Optional[_Iterable[_Union[PlannedView, _Mapping]]] = ..., before: _Optional[float] = ..., after: _Optional[float] = ..., path_mm: _Optional[float] = ..., registration: _Optional[str] = ..., queue_ms: _Optional[float] = ..., plan_ms: _Optional[float] = ...) -> None: ...
+
 class Display(_message.Message):
     __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge", "gain_db_between", "dynamic_range_db_between", "display_seed")
     GAIN_DB_FIELD_NUMBER: _ClassVar[int]

@@ -59,6 +59,11 @@ class RenderServiceStub:
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
                 _registered_method=True)
+        self.PlanViews = channel.unary_unary(
+                '/ultragray.v1.RenderService/PlanViews',
+                request_serializer=ultragray_dot_v1_dot_rendering__pb2.PlanViewsRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_rendering__pb2.PlanViewsResponse.FromString,
+                _registered_method=True)
         self.RenderStream = channel.stream_stream(
                 '/ultragray.v1.RenderService/RenderStream',
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderStreamRequest.SerializeToString,
@@ -109,6 +114,14 @@ class RenderServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def PlanViews(self, request, context):
+        """Where to look next: poses in reach whose frames would teach a scene most, in an order to travel them. It waits behind
+        frames of interactive callers, and counts as 100 frames of the key's limit.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def RenderStream(self, request_iterator, context):
         """Poses in, frames out, in the order of the poses. The first message must carry settings, later ones may; its mode is
         that of the stream. ORDERED answers every pose, several in flight (8; then the stream stops reading). LATEST is for
@@ -152,6 +165,11 @@ def add_RenderServiceServicer_to_server(servicer, server):
                     servicer.Localize,
                     request_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.SerializeToString,
+            ),
+            'PlanViews': grpc.unary_unary_rpc_method_handler(
+                    servicer.PlanViews,
+                    request_deserializer=ultragray_dot_v1_dot_rendering__pb2.PlanViewsRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_rendering__pb2.PlanViewsResponse.SerializeToString,
             ),
             'RenderStream': grpc.stream_stream_rpc_method_handler(
                     servicer.RenderStream,
@@ -294,6 +312,33 @@ class RenderService:
             '/ultragray.v1.RenderService/Localize',
             ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
             ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PlanViews(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.RenderService/PlanViews',
+            ultragray_dot_v1_dot_rendering__pb2.PlanViewsRequest.SerializeToString,
+            ultragray_dot_v1_dot_rendering__pb2.PlanViewsResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -63,6 +63,7 @@ OPERATIONS = (
     _operation("slice", _READER, "POST /v1/scenes/{scene}:slice", "RenderService/RenderSlice"),
     _operation("render.batch", _READER, "RenderService/RenderBatch", about=Kind.SCENE),
     _operation("scene.localize", _READER, "POST /v1/scenes/{scene}:localize", "RenderService/Localize"),
+    _operation("scene.plan", _READER, "POST /v1/scenes/{scene}:plan", "RenderService/PlanViews"),
     _operation(STREAM, _READER, f"{WEBSOCKET} /v1/scenes/{{scene}}/stream", "RenderService/RenderStream"),
     _operation("stream.list", _READER, "GET /v1/streams"),
     _operation(WATCH, _READER, f"{WEBSOCKET} /v1/streams/{{stream}}/watch"),

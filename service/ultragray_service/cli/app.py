@@ -47,6 +47,7 @@ _COMMANDS = {  # by the panels of the help
         "render": (".render:render", "Render frames from poses into one file or a folder of PNGs."),
         "export": (".scenes:export", "Write a scene as PLY or as a checkpoint of the released code."),
         "localize": (".register:localize", "Find the pose of a real frame in a scene."),
+        "plan": (".plan:plan", "Find where to look next: views that would teach a scene most."),
         "calibrate": (".register:calibrate_app", "Register a robot or tracker to a scene."),
         "label": (".labels:label", "Label the Gaussians of a scene by a NIfTI map or by painted frames."),
         "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),

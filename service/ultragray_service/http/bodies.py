@@ -27,6 +27,7 @@ from ultragray.geometry.motion import MAX_AHEAD_MS
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
@@ -221,6 +222,23 @@ class LocalizeBody(LocalizationSettings):
 
 
 LARGE_IMAGE = Apart("image", str)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanBody(PlanSettings):
+    """Which views are looked for."""
+
+    poses: list[Pose] | None = described(
+        f"All that is in reach, at most {MAX_LISTED}, instead of the skin. Default: the skin.", None, error=InvalidPose
+    )
+    view: Pose | None = described("A standard plane: only the points of its image count.", None, error=InvalidPose)
+    start: Pose | None = described("Where the probe is. Default: the way begins anywhere.", None, error=InvalidPose)
+    registration: str | None = registration_field()
+    timeout_ms: float | None = described(
+        "A plan that is not ready by then is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+
+    many_poses = staticmethod(partial(_many_poses, MAX_LISTED))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.volumes import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
@@ -47,7 +48,7 @@ from ultragray_service.rpc.messages import (
 )
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
-from ultragray_service.views.poses import locate, sought_frame
+from ultragray_service.views.poses import locate, next_views, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
 
@@ -284,6 +285,30 @@ class RenderService:
         registration = request.registration if request.HasField("registration") else None
         found = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)
         return to_message(found, rendering_pb2.LocalizeResponse)
+
+    async def PlanViews(
+        self, request: rendering_pb2.PlanViewsRequest, context: Context
+    ) -> rendering_pb2.PlanViewsResponse:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        asked, poses = read(request, PlanSettings), None
+        if count := len(request.poses):
+            check_pose_count(count, MAX_LISTED)
+            poses = await exact_poses(count, lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        view, start = (
+            read_pose(getattr(request, name), name) if request.HasField(name) else None for name in ("view", "start")
+        )
+        registration = request.registration if request.HasField("registration") else None
+        found = await next_views(
+            self._service.rendering,
+            request.scene,
+            asked,
+            deadline,
+            poses=poses,
+            view=view,
+            start=start,
+            registration=registration,
+        )
+        return to_message(found, rendering_pb2.PlanViewsResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         scene, asked = read_settings(request)

@@ -19,10 +19,11 @@ from prometheus_client.registry import Collector
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
+from ultragray.learn.localization.settings import Localization
 from ultragray_service.access.principals import acting
 from ultragray_service.errors import statuses_of
 from ultragray_workers.jobs.store import JobsOverview
-from ultragray_workers.pool.messages import LocalizeResult, RenderResult
+from ultragray_workers.pool.messages import RenderResult, SearchResult
 from ultragray_workers.pool.pool import RenderPool
 
 STEP_S = 5
@@ -292,7 +293,7 @@ class Metrics:
         self._batch.observe(result.batch_size)
         self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
 
-    def observe_search(self, result: LocalizeResult) -> None:
+    def observe_search(self, result: SearchResult[Localization]) -> None:
         self._searches.labels(self._label_of(result.scene), str(result.found.is_found).lower()).inc()
         self._search.observe(result.search_ms / 1000)
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.learn.localization.settings import Localization, LocalizationSettings
+from ultragray.learn.planning.settings import PlanSettings, ViewPlan
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.info import SceneHeader
@@ -18,7 +23,15 @@ from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
-from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
+from ultragray_workers.pool.messages import (
+    NextViews,
+    Priority,
+    RenderRequest,
+    SceneChangedError,
+    Search,
+    SearchResult,
+    Sought,
+)
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
 
 
@@ -85,7 +98,7 @@ class Located:
     search_ms: float = described("Time of the search.")
 
     @classmethod
-    def of(cls, result: LocalizeResult, plan: Plan) -> Located:
+    def of(cls, result: SearchResult[Localization], plan: Plan) -> Located:
         found = result.found
         in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
         same = ("similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg")
@@ -108,7 +121,7 @@ def sought_frame(image: bytes, height: int | None, width: int | None, settings: 
             "image_height and image_width go together: both for grey pixels, neither for a PNG file",
             field="image_height" if height is None else "image_width",
         )
-    return Sought(image, None if height is None or width is None else (height, width), settings)
+    return Sought(image, settings, None if height is None or width is None else (height, width))
 
 
 async def locate(
@@ -123,25 +136,118 @@ async def locate(
 
     `registration` leads the start into the scene, and the found pose back.
 
-    It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.localize and
+    Raises what `_searched` raises.
+    """
+    result, plan = await _searched(
+        rendering, scene, sought.settings.probe, lambda plan: (sought, plan.placed(start)), deadline, registration
+    )
+    rendering.metrics.observe_search(result)
+    return Located.of(result, plan)
+
+
+async def _searched(
+    rendering: Rendering,
+    scene: str,
+    probe: Probe | None,
+    search: Callable[[Plan], tuple[Search, FloatArray]],
+    deadline: float,
+    registration: str | None,
+) -> tuple[SearchResult[Any], Plan]:
+    """What a search, and the pose that it starts from, come to until the `deadline` (time.monotonic(), s).
+
+    It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.search and
     RequestPlanner.plan raise, and RateLimited.
     """
     rendering.life.require_serving()
     account().target = scene
-    plan = await rendering.planner.plan(
-        scene, FrameSettings(probe=sought.settings.probe), Encoding.UINT8, registration=registration
-    )
+    plan = await rendering.planner.plan(scene, FrameSettings(probe=probe), Encoding.UINT8, registration=registration)
     await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
     for _ in range(MAX_SCENE_CHANGES):
-        asked = RenderRequest(
-            plan.scene, sought, plan.placed(start)[None], Priority.BATCH, deadline, plan.version, caller()
-        )
+        what, start = search(plan)
+        asked = RenderRequest(plan.scene, what, start[None], Priority.BATCH, deadline, plan.version, caller())
         try:
             with scene_to_blame():
-                result = await rendering.pool.localize(asked)
+                result = await rendering.pool.search(asked)
         except SceneChangedError:
             await plan.renew()
         else:
-            rendering.metrics.observe_search(result)
-            return Located.of(result, plan)
-    raise RenderFailed(f"scene {plan.scene!r} kept changing while the frame was looked for", field="scene")
+            return result, plan
+    raise RenderFailed(f"scene {plan.scene!r} kept changing while it was searched", field="scene")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedView:
+    """A view of a plan."""
+
+    pose: MatrixRows = described("Probe to scene, mm.")
+    flange_to_base: MatrixRows | None = described(
+        "The same as the pose of the registration; null: none was named.", None
+    )
+    gain: float = described("What it is expected to add to what is wanted, beside the views of lower ranks.")
+    rank: int = described("0: it was chosen first, as it gains most.")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Planned:
+    """Where to look next."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    views: list[PlannedView] = described(
+        "In an order to travel them; fewer than were asked for where no other would gain anything."
+    )
+    before: float = described("What is wanted, as the scene has it: a share, 0 to 1; of confidence an MS-SSIM.")
+    after: float = described("And as it is expected to be with the views.")
+    path_mm: float = described("Length of the way through the views, from the start where one was given.")
+    registration: str | None = described("That led the poses into the scene; null: none.", None)
+    queue_ms: float = described("Waiting time.")
+    plan_ms: float = described("Time of the search.")
+
+    @classmethod
+    def of(cls, result: SearchResult[ViewPlan], plan: Plan) -> Planned:
+        found, registration = result.found, plan.registration
+        views = [
+            PlannedView(
+                pose=pose.tolist(),
+                flange_to_base=None if registration is None else registration.flange_to_base(pose).tolist(),
+                gain=gain,
+                rank=rank,
+            )
+            for pose, gain, rank in zip(found.poses, found.gains.tolist(), found.ranks.tolist(), strict=True)
+        ]
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            views=views,
+            before=found.before,
+            after=found.after,
+            path_mm=found.path_mm,
+            registration=plan.settings.registration,
+            queue_ms=round(result.queue_ms, 3),
+            plan_ms=round(result.search_ms, 3),
+        )
+
+
+async def next_views(
+    rendering: Rendering,
+    scene: str,
+    settings: PlanSettings,
+    deadline: float,
+    *,
+    poses: FloatArray | None,  # [C, 4, 4] mm, exact: all that is in reach
+    view: FloatArray | None,  # [4, 4] mm, exact
+    start: FloatArray | None,  # [4, 4] mm, exact
+    registration: str | None,
+) -> Planned:
+    """Where to look next in a scene; `registration` leads all poses into it, and the planned ones back.
+
+    Raises what `_searched` raises.
+    """
+
+    def search(plan: Plan) -> tuple[Search, FloatArray]:
+        placed = [None if one is None else plan.placed(one) for one in (poses, view, start)]
+        data = b"" if placed[0] is None else placed[0].tobytes()
+        return NextViews(data, settings, placed[1], placed[2]), np.eye(4)
+
+    result, plan = await _searched(rendering, scene, settings.probe, search, deadline, registration)
+    return Planned.of(result, plan)

@@ -28,7 +28,7 @@ from ultragray_workers.pool.messages import (
     PoolConfig,
     Rendered,
     SceneChangedError,
-    Sought,
+    Search,
     Task,
     TaskPart,
     UnloadTask,
@@ -340,9 +340,9 @@ class Dispatcher:
         """The file that the frames of a ticket are written to; with it a ticket counts as begun."""
         if ticket.memory is None:
             ticket.memory = self._memories.acquire()
-            if isinstance(ticket.request.settings, Sought):
+            if isinstance(ticket.request.settings, Search):
                 os.ftruncate(ticket.memory, 0)
-                write_at(ticket.memory, memoryview(ticket.request.settings.image), 0)
+                write_at(ticket.memory, memoryview(ticket.request.settings.data), 0)
         return ticket.memory
 
     def _archive(self, ticket: Ticket) -> int:
@@ -466,9 +466,9 @@ def _task(ticket: Ticket, parts: list[Part]) -> Task[Any]:
     return Task(scene=ticket.request.scene, path=ticket.path, version=ticket.request.version, parts=found)
 
 
-def _sent(settings: Resolved | SliceView | Sought) -> Resolved | SliceView | Sought:
-    """Settings as a message takes them: what is sought lies in the memory."""
-    return replace(settings, image=b"") if isinstance(settings, Sought) else settings
+def _sent(settings: Resolved | SliceView | Search) -> Resolved | SliceView | Search:
+    """Settings as a message takes them: the data of a search lie in the memory."""
+    return replace(settings, data=b"") if isinstance(settings, Search) else settings
 
 
 def _pack_task(ticket: Ticket) -> PackTask:

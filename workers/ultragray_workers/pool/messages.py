@@ -16,6 +16,7 @@ from ultragray.contract import Contract, described
 from ultragray.errors import UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import Localization, LocalizationSettings
+from ultragray.learn.planning.settings import PlanSettings, ViewPlan
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray.scene.confidence import Extrapolation
@@ -89,20 +90,39 @@ class PoolConfig(Contract):
 
 
 @dataclass(frozen=True, eq=False)
-class Sought:
-    """A real frame that is looked for in a scene. Its pixels are read, and checked, where it is looked for."""
+class Search:
+    """Something that is looked for in a scene, by a task of its own. Its data go through the memory of its request."""
 
-    image: bytes  # a PNG file, or uint8 row by row where there is a size
-    size: tuple[int, int] | None  # height and width
-    settings: LocalizationSettings
+    data: bytes
+    settings: LocalizationSettings | PlanSettings
 
     @property
     def view(self) -> tuple[Any, ...]:
         return (self.settings,)
 
 
+@dataclass(frozen=True, eq=False)
+class Sought(Search):
+    """A real frame: a PNG file, or uint8 row by row where there is a size. Read and checked where it is looked for."""
+
+    settings: LocalizationSettings
+    size: tuple[int, int] | None  # height and width
+
+
+@dataclass(frozen=True, eq=False)
+class NextViews(Search):
+    """Views that would teach the scene most. The data are the poses in reach, float64 [C, 4, 4]; none: the settings
+    say what is.
+    """
+
+    settings: PlanSettings
+    standard_plane: FloatArray | None  # [4, 4] mm
+    start: FloatArray | None  # [4, 4] mm
+
+
+F = TypeVar("F", bound=Localization | ViewPlan, default=Localization)
 S = TypeVar("S", bound=Resolved | SliceView, default=Resolved)  # settings of a frame, or of a slice
-W = TypeVar("W", bound=Resolved | SliceView | Sought, default=Resolved)  # what is to be done at each pose
+W = TypeVar("W", bound=Resolved | SliceView | Search, default=Resolved)  # what is to be done at each pose
 
 
 class Priority(IntEnum):
@@ -131,7 +151,7 @@ class Destination(Protocol):
 class RenderRequest(Generic[W]):
     """Frames, or slices, of one scene for some poses; everything but the scene has been checked by the caller.
 
-    For what is `Sought` nothing is rendered at the one pose: it is where the search for that frame starts.
+    For a `Search` nothing is rendered at the one pose: it is where that for a frame starts.
     """
 
     scene: str
@@ -182,13 +202,13 @@ class RenderResult(Generic[S]):
 
 
 @dataclass(frozen=True, eq=False)
-class LocalizeResult:
-    """Where a frame was found, and what the search took."""
+class SearchResult(Generic[F]):
+    """What a search has found, and what it took."""
 
     scene: str
     scene_sha256: str
     renderer: str
-    found: Localization
+    found: F
     queue_ms: float  # from the call to the start of the search
     search_ms: float
 
@@ -287,7 +307,7 @@ class Rendered:
     encode_ms: float
     first: int = 0  # pose of the request that the part begins with
     extrapolations: tuple[Extrapolation, ...] = ()  # of the part's poses
-    found: Localization | None = None  # of a frame that was looked for
+    found: Localization | ViewPlan | None = None  # of a search
 
 
 @dataclass(frozen=True)

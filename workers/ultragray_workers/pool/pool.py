@@ -24,14 +24,14 @@ from ultragray_workers.pool.channel import read_start
 from ultragray_workers.pool.dispatcher import Dispatcher
 from ultragray_workers.pool.messages import (
     LoadTask,
-    LocalizeResult,
     PoolConfig,
     Rendered,
     RenderRequest,
     RenderResult,
     S,
     SceneChangedError,
-    Sought,
+    Search,
+    SearchResult,
     UnloadTask,
 )
 from ultragray_workers.pool.processes import Launcher
@@ -120,12 +120,13 @@ class RenderPool:
         self.on_rendered(result)
         return result
 
-    async def localize(self, request: RenderRequest[Sought]) -> LocalizeResult:
-        """Looks for a real frame about the pose of the request; its turn comes, and ends, as that of a rendering.
+    async def search(self, request: RenderRequest[Search]) -> SearchResult[Any]:
+        """Looks for a real frame about the pose of the request, or for views; its turn comes, and ends, as that of a
+        rendering.
 
         Raises what `render` raises; InvalidArgument and InvalidImageSize also for pixels that are no frame.
         """
-        return await self._answered(request, Turn(), _place_found)
+        return await self._answered(request, Turn(), _what_was_found)
 
     async def _answered(
         self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
@@ -239,7 +240,7 @@ class RenderPool:
         """Raises InvalidArgument for a request that no reply can hold."""
         if not len(request.poses):
             raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
-        if not isinstance(request.settings, Sought):
+        if not isinstance(request.settings, Search):
             _check_reply(request.settings, len(request.poses))
         return Ticket(
             request=request,
@@ -285,9 +286,8 @@ async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
     )
 
 
-async def _place_found(ticket: Ticket, rendered: Rendered) -> LocalizeResult:
-    assert rendered.found is not None
-    return LocalizeResult(
+async def _what_was_found(ticket: Ticket, rendered: Rendered) -> SearchResult[Any]:
+    return SearchResult(
         scene=ticket.request.scene,
         scene_sha256=rendered.scene_sha256,
         renderer=rendered.renderer,

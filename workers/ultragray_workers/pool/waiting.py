@@ -15,7 +15,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest, Sought
+from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest, Search
 from ultragray_workers.pool.turns import Forecast, Turns
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
@@ -309,7 +309,7 @@ class WaitingQueue:
             self._turns[request.priority].leave(request.caller, ticket, frames, work_s)
 
     def _take_company(self, first: Part) -> list[Part]:
-        if first.suspect or first.packs or isinstance(first.ticket.request.settings, Sought):
+        if first.suspect or first.packs or isinstance(first.ticket.request.settings, Search):
             return []
         room = self._poses_together(first.ticket) - first.frames
         company: list[Part] = []
@@ -345,8 +345,8 @@ class WaitingQueue:
     def _poses_together(self, ticket: Ticket) -> int:
         """The number of poses in a full batch: fewer for images of more than 512x512 pixels, and for slow ones."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
-        settings: Resolved | SliceView | Sought = ticket.request.settings
-        if isinstance(settings, Sought | SliceView):
+        settings: Resolved | SliceView | Search = ticket.request.settings
+        if isinstance(settings, Search | SliceView):
             return 1
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels

@@ -28,6 +28,7 @@ from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.pixels import read_grey, read_png
 from ultragray.learn.localization.search import localize
+from ultragray.learn.planning.search import plan_views
 from ultragray.rendering.backends import cuda
 from ultragray.rendering.backends.registry import render_device, renderer_name
 from ultragray.rendering.confidence import SupportWatch
@@ -49,6 +50,7 @@ from ultragray_workers.pool.messages import (
     Hello,
     Loading,
     LoadTask,
+    NextViews,
     Outcome,
     PackTask,
     Rendered,
@@ -299,7 +301,21 @@ class _Worker:
         )
         return self._rendered(loaded, started, found=found)
 
-    _WORK: ClassVar[dict[type, Callable[..., Rendered]]] = {SliceView: _sample, Sought: _search}  # on one part
+    def _plan(self, task: Task[NextViews], part: TaskPart[NextViews], memory: int) -> Rendered:
+        loaded, asked = self._scene_of(task), part.settings
+        started = time.monotonic()
+        listed = np.frombuffer(read_start(memory, os.fstat(memory).st_size)).reshape(-1, 4, 4)
+        found = plan_views(
+            loaded.scene,
+            asked.settings,
+            poses=listed if len(listed) else None,
+            view=asked.standard_plane,
+            start=asked.start,
+            limits=self._limits(lambda _: "poses"),
+        )
+        return self._rendered(loaded, started, found=found)
+
+    _WORK: ClassVar[dict[type, Callable[..., Rendered]]] = {SliceView: _sample, Sought: _search, NextViews: _plan}
 
 
 def example_probes() -> tuple[Probe, ...]:

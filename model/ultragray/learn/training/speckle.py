@@ -278,6 +278,8 @@ LEAST_PAIRS = 60  # of windows
 def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: IntArray, backend: str) -> SpeckleModel:
     """The model with the slice's width and the carrier by which windows decorrelate as those of the frames do."""
     pairs = frame_pairs(sweep)
+    if not len(pairs):  # frames too far apart to share any speckle
+        return model
     frames = np.unique(pairs)
     part = sweep.select(frames)
     places = np.searchsorted(frames, pairs)

@@ -6,7 +6,7 @@ import asyncio
 import base64
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from ultragray.contract import described
 from ultragray.errors import InvalidArgument
 from ultragray.files import file_sha256
 from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.scene.info import SceneHeader
 from ultragray_service.core.poses import check_pose_count, exact_poses
@@ -41,6 +42,7 @@ from ultragray_service.http.bodies import (
     LabelBody,
     LabelMapBody,
     LocalizeBody,
+    PlanBody,
     body_schema,
     read_json_body,
 )
@@ -60,7 +62,7 @@ from ultragray_service.http.dependencies import (
     revalidated,
 )
 from ultragray_service.http.routes.datasets import Private
-from ultragray_service.views.poses import Assessments, Located, locate, sought_frame
+from ultragray_service.views.poses import Assessments, Located, Planned, locate, next_views, sought_frame
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIXES, base_name
 
@@ -106,6 +108,32 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     image = await asyncio.to_thread(_bytes_of, body.image)
     sought = sought_frame(image, body.image_height, body.image_width, search)
     work = locate(service.rendering, scene, sought, body.start.exact("start"), deadline, body.registration)
+    return await finish_or_abandon(work, request.receive, deadline)
+
+
+@router.post(
+    "/{scene}:plan",
+    openapi_extra=body_schema(PlanBody),
+    responses=problems(401, 404, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def plan_views(request: Request, service: ServiceDep, scene: SceneName) -> Planned:
+    """Where to look next: poses in reach whose frames would teach the scene most, in an order to travel them."""
+    body = await read_json_body(request, PlanBody, PlanBody.many_poses())
+    deadline = service.planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
+    listed, poses = body.poses, None
+    if listed is not None:
+        check_pose_count(len(listed), MAX_LISTED)
+        poses = await exact_poses(len(listed), lambda index: listed[index].exact(f"poses[{index}]"))
+    work = next_views(
+        service.rendering,
+        scene,
+        PlanSettings(**{item.name: getattr(body, item.name) for item in fields(PlanSettings)}),
+        deadline,
+        poses=poses,
+        view=None if body.view is None else body.view.exact("view"),
+        start=None if body.start is None else body.start.exact("start"),
+        registration=body.registration,
+    )
     return await finish_or_abandon(work, request.receive, deadline)
 
 
