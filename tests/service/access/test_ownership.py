@@ -69,6 +69,7 @@ BODIES = {
     "render": {"pose": POSE},
     "slice": {"origin_mm": [0, 0, 0], "size_mm": [1, 1]},
     "scene}:localize": {"image": "", "start": POSE},
+    "scene}:plan": {},
     "scene}:assess": {"poses": [POSE]},
     "scene}:label": {"into": "mine", "frames": [{"pose": POSE, "labels": ""}]},
     "scene}:label-by-map": {"into": "mine", "label_map": ""},
