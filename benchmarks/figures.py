@@ -31,6 +31,7 @@ import measuring
 import methods_tables
 import poses
 import prediction
+import preview
 import results_tables
 import speckle
 from measuring import Document, Lines, columns, described, heads, kept, read, staged, table
@@ -52,7 +53,7 @@ TARGETS = {
         name: name
         for name in (
             *("ablations", "poses", "hand", "localization", "confidence"),
-            *("speckle", "environment", "prediction", "ros"),
+            *("speckle", "environment", "prediction", "preview", "ros"),
         )
     },
     "compressed": "compressed",
@@ -364,6 +365,7 @@ BLOCKS = {
     "operations of a frame": Block("cuda", operations_of_a_frame),
     "environment": Block("environment", environment),
     "foretold poses": Block("prediction", prediction.foretold_poses),
+    "previewed frames": Block("preview", preview.previewed_frames),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),
     "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),

@@ -22,12 +22,14 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.exchange import ros_messages, ros_recording
 from ultragray.geometry import pose
-from ultragray.geometry.motion import Prediction
+from ultragray.geometry.motion import MAX_AHEAD_MS, Prediction
 from ultragray.geometry.probe import ElevationBeam
 from ultragray.learn.planning.settings import PlanSettings
+from ultragray.rendering.preview import Preview
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
+from ultragray_service.core.clocks import ClockOffset
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
@@ -40,6 +42,8 @@ ROOTS = {
     "SettingsUsed": SettingsUsed,
     "Extrapolation": Extrapolation,
     "Prediction": Prediction,
+    "ClockOffset": ClockOffset,
+    "Preview": Preview,
     "SliceSettings": SliceSettings,
     "PlanSettings": PlanSettings,
     "ElevationBeam": ElevationBeam,
@@ -161,7 +165,7 @@ def _below(base: str, bases: dict[str, str], indent: str = "") -> list[tuple[str
 
 def generate_contract(output_folder: Path) -> Path:
     """Writes contract.py and returns its path."""
-    sources: dict[str, str] = {}
+    sources = {"MAX_AHEAD_MS": f"MAX_AHEAD_MS = {MAX_AHEAD_MS}  # that the service foretells a pose\n"}
     for name, cls in ROOTS.items():
         _add(sources, cls, name)
     names = sorted(sources, key=lambda name: (not name.isupper(), name))  # constants first

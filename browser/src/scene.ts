@@ -47,6 +47,8 @@ export class Frame {
     readonly extrapolation: Extrapolation,
     /** The type of labels among the bytes. */
     private readonly labelsAs: FrameInfo["encoding"] = "uint8",
+    /** Of a scene that is connected with `seenAfter_ms`: how its pose was foretold. */
+    readonly prediction: Schemas["Prediction"] | null = null,
   ) {}
 
   /** One output, [height, width] row by row. Throws for one that was not asked for. */
@@ -228,7 +230,10 @@ class ArrivingScene implements Scene {
   }
 }
 
-type Waiting = { resolve: (frame: Frame) => void; reject: (error: Error) => void };
+type Waiting = { asked_ms: number; resolve: (frame: Frame) => void; reject: (error: Error) => void };
+
+const MOST_AHEAD_MS = 1000; // of predict_ms
+const LATENCIES = 32; // whose median is expected of the next frame
 
 class ServedScene implements Scene {
   readonly whole = Promise.resolve();
@@ -237,11 +242,13 @@ class ServedScene implements Scene {
   #sequence = 0;
   #waiting = new Map<number, Waiting>();
   #sent = "";
+  #latencies_ms: number[] = [];
 
   constructor(
     private readonly address: URL,
     private readonly protocols: string[],
     readonly info: SceneInfo,
+    private readonly seenAfter_ms?: number,
   ) {}
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
@@ -250,13 +257,22 @@ class ServedScene implements Scene {
     const socket = await this.#socket;
     return new Promise((resolve, reject) => {
       this.#sequence += 1;
-      this.#waiting.set(this.#sequence, { resolve, reject });
+      const asked_ms = performance.now();
+      this.#waiting.set(this.#sequence, { asked_ms, resolve, reject });
       const written = JSON.stringify(settings);
       const rows = [0, 4, 8, 12].map((at) => matrix.slice(at, at + 4));
       const changed = written === this.#sent ? {} : { settings };
       this.#sent = written;
-      socket.send(JSON.stringify({ sequence: this.#sequence, mode: "ordered", pose: { matrix: rows }, ...changed }));
+      const times = { client_time_ms: asked_ms, ...this.#ahead() };
+      socket.send(JSON.stringify({ sequence: this.#sequence, mode: "ordered", pose: { matrix: rows }, ...times, ...changed }));
     });
+  }
+
+  /** From now to when the frame of a pose will be seen, where frames are to be those of then. */
+  #ahead(): { predict_ms?: number } {
+    if (this.seenAfter_ms === undefined) return {};
+    const median_ms = [...this.#latencies_ms].sort((a, b) => a - b)[this.#latencies_ms.length >> 1] ?? 0;
+    return { predict_ms: Math.min(this.seenAfter_ms + median_ms, MOST_AHEAD_MS) };
   }
 
   close(): void {
@@ -290,7 +306,11 @@ class ServedScene implements Scene {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
     const begin = Math.ceil((4 + length) / 8) * 8;
-    this.#settle(header.sequence)?.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin), header.extrapolation, header.encoding as FrameInfo["encoding"]));
+    const waiting = this.#settle(header.sequence);
+    if (waiting === undefined) return;
+    this.#latencies_ms = [...this.#latencies_ms.slice(1 - LATENCIES), performance.now() - waiting.asked_ms];
+    const encoding = header.encoding as FrameInfo["encoding"];
+    waiting.resolve(new Frame(header as unknown as FrameInfo, new Uint8Array(data, begin), header.extrapolation, encoding, header.prediction));
   }
 
   #settle(sequence: number): Waiting | undefined {
@@ -323,6 +343,11 @@ export interface LoadOptions {
   renderer?: RendererChoice;
 }
 
+export interface ConnectOptions {
+  key?: string;
+  seenAfter_ms?: number;
+}
+
 export const Scene = {
   /** A scene file, of an address or of its bytes, whose frames are rendered here. Throws, in a sentence, for what is none.
    *
@@ -343,15 +368,19 @@ export const Scene = {
     return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress, renderer) : scene;
   },
 
-  /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed. */
-  async connect(service: string | URL, name: string, { key }: { key?: string } = {}): Promise<Scene> {
+  /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed.
+   *
+   * `seenAfter_ms`: each is that of where the probe will be so long after it comes, foretold from the poses that were
+   * asked for and when; `frame.prediction` says how far ahead that is. Left out: of the poses as they are.
+   */
+  async connect(service: string | URL, name: string, { key, seenAfter_ms }: ConnectOptions = {}): Promise<Scene> {
     const address = new URL(`/v1/scenes/${encodeURIComponent(name)}`, service);
     const answer = await fetch(address, key === undefined ? {} : { headers: { Authorization: `Bearer ${key}` } });
     if (!answer.ok) throw new Error(`${address.href} answers ${answer.status} ${answer.statusText}`);
     const info = (await answer.json()) as SceneInfo;
     const stream = new URL(`${address.pathname}/stream`, address);
     stream.protocol = address.protocol === "https:" ? "wss:" : "ws:";
-    return new ServedScene(stream, key === undefined ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`], info);
+    return new ServedScene(stream, key === undefined ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`], info, seenAfter_ms);
   },
 };
 

@@ -440,8 +440,8 @@ class _Client(Group[AnyConnection]):
         are for as long as anything refers to one of them. While 16 frames are held, others come in their messages, as
         do those of more than 16 MiB.
 
-        `seen_after_ms`, 0 to 1000: frames are those of where the probe will be when they are seen, so long after they
-        arrive here; None: of the poses as they were sent. The pose is foretold from those before it and their
+        `seen_after_ms`, 0 to `MAX_AHEAD_MS`: frames are those of where the probe will be when they are seen, so long
+        after they arrive here; None: of the poses as they were sent. A pose is foretold from those before it and their
         `measured_ns`, for the median latency of the last frames; `frame.pose` is where, and `frame.prediction` says
         how far ahead that is, and how wrong it is expected to be.
         """

@@ -13,11 +13,13 @@ from typing import Any, Literal, TypeAlias
 from .geometry import Picture, PoseLike
 
 __all__ = [
+    "MAX_AHEAD_MS",
     "PROBES",
     "Additions",
     "AroundSampler",
     "Below",
     "Box",
+    "ClockOffset",
     "CompareJob",
     "ComparisonSettings",
     "Contact",
@@ -39,6 +41,7 @@ __all__ = [
     "PhasedProbe",
     "PlanSettings",
     "Prediction",
+    "Preview",
     "Probe",
     "RadialProbe",
     "RenderJob",
@@ -57,6 +60,7 @@ __all__ = [
     "TrainingSampler",
     "VoxelizeJob",
 ]
+MAX_AHEAD_MS = 1000.0  # that the service foretells a pose
 
 
 @dataclass(frozen=True)
@@ -322,6 +326,32 @@ class Prediction:
     ahead_ms: float  # From the time of the newest pose to that of the frame.
     error_mm: float | None  # Of the position; null: too few poses have come to tell.
     error_deg: float | None  # Of the rotation, likewise.
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """The client's clock beside the service's, as it is when the answer is sent."""
+
+    offset_ms: float  # Client's time minus service's.
+    # The offset is off by no more: half of the fastest round trip, and the standard deviation of the fit.
+    uncertainty_ms: float
+    drift_ppm: float  # What the client's clock gains, microseconds a second.
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What a frame of a stream that gets real frames shows, and how far to trust it."""
+
+    real_age_ms: float  # From the newest real frame to the time of this one.
+    moved_mm: float  # By the image since then, root mean square.
+    is_real: bool  # It is the late real frame itself: that came nearer to the truth than what is rendered.
+    # Root mean square of grey values from 0 to 1, as of the last real frames when they came; null: too few have.
+    expected_error: float | None
+    agreement: float  # Correlation of the structures of the newest real frame and the scene's, -1 to 1.
+    trust: float | None  # Confidence times agreement, 0 to 1; null: the scene knows no confidence.
+    offset_mm: float  # By which the scene was moved to where the real frames show it.
+    offset_deg: float  # Likewise.
+    disagrees: bool  # The newest real frame is not of the scene there, also after a search about its pose.
 
 
 @dataclass(frozen=True, kw_only=True)

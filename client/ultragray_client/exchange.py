@@ -20,9 +20,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy.typing as npt
+
 from ultragray_client.connection import error_of_frame
+from ultragray_client.contract import MAX_AHEAD_MS
 from ultragray_client.errors import Draining, InvalidArgument
-from ultragray_client.frames import Frame, frame_from_message
+from ultragray_client.frames import Frame, frame_from_message, put_image
 from ultragray_client.geometry import PoseLike, pose_message
 from ultragray_proto.v1 import rendering_pb2
 
@@ -111,7 +114,6 @@ def _remove(path: Path, listener: socket.socket) -> None:
 
 
 MAX_WAITING = 64  # poses of an ordered stream; then its sender waits
-MAX_PREDICT_MS = 1000.0  # that the service foretells a pose
 _LATENCIES = 32  # of the newest frames, whose median is expected of the next
 WINDOW = 2  # answers of a latest stream that may wait for the caller: one comes while the other is looked at
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
@@ -151,9 +153,9 @@ class PoseExchange:
         """Raises InvalidArgument for a mode that does not exist, a `seen_after_ms` out of range, and where this system
         cannot share memory.
         """
-        if seen_after_ms is not None and not 0.0 <= seen_after_ms <= MAX_PREDICT_MS:
+        if seen_after_ms is not None and not 0.0 <= seen_after_ms <= MAX_AHEAD_MS:
             raise InvalidArgument(
-                f"seen_after_ms must be from 0 to {MAX_PREDICT_MS:g}, got {seen_after_ms:g}", field="seen_after_ms"
+                f"seen_after_ms must be from 0 to {MAX_AHEAD_MS:g}, got {seen_after_ms:g}", field="seen_after_ms"
             )
         try:
             self.mode = StreamMode(mode)
@@ -167,6 +169,7 @@ class PoseExchange:
         self._dropped = 0
         self._memory = SharedMemory() if shared_memory else None
         self._is_open = False
+        self._newest_ns: tuple[int, int] | None = None  # answer of this connection: when it was sent, and came
 
     @property
     def scene(self) -> str:
@@ -181,7 +184,7 @@ class PoseExchange:
         if self._memory is not None and self._is_open:
             self._memory.close()
             self._memory = SharedMemory()
-        self._is_open = True
+        self._is_open, self._newest_ns = True, None
         mode = f"STREAM_MODE_{self.mode.name}"
         window = WINDOW if self.mode is StreamMode.LATEST else None
         memory = None if self._memory is None else self._memory.message()
@@ -212,8 +215,24 @@ class PoseExchange:
         self._sequence += 1
         return message
 
+    def real(self, image: npt.ArrayLike | bytes, measured_ns: int) -> rendering_pb2.RenderStreamRequest:
+        """The message of a real frame. Raises InvalidArgument."""
+        message = rendering_pb2.RenderStreamRequest(real=rendering_pb2.RealFrame(client_time_ns=measured_ns))
+        put_image(message.real, image)
+        return message
+
+    def departing(self, message: rendering_pb2.RenderStreamRequest) -> rendering_pb2.RenderStreamRequest:
+        """The message, with what aligns the clocks of client and service as it goes."""
+        message.ClearField("clock")
+        if self._newest_ns is not None:
+            sent_ns, arrived_ns = self._newest_ns
+            stamps = {"answer_sent_ns": sent_ns, "answer_arrived_ns": arrived_ns, "sent_ns": time.monotonic_ns()}
+            message.clock.CopyFrom(rendering_pb2.ClockStamps(**stamps))
+        return message
+
     def arrived(self, message: rendering_pb2.Frame) -> Answer:
         """A message that came over the connection that was opened last."""
+        self._newest_ns = message.sent_ns, time.monotonic_ns()
         return Answer(message, self._memory)
 
     def frame(self, answer: Answer, dropped_here: int = 0) -> Frame:
@@ -236,7 +255,7 @@ class PoseExchange:
         """From the measurement of the next pose to when its frame will be seen; None: no pose is to be foretold."""
         if self._seen_after_ms is None:
             return None
-        return min(self._seen_after_ms + median(self._latencies_ms or [0.0]), MAX_PREDICT_MS)
+        return min(self._seen_after_ms + median(self._latencies_ms or [0.0]), MAX_AHEAD_MS)
 
     def close(self) -> None:
         """No frames are asked for any more; those that came stay."""

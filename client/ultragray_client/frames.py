@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from ultragray_client.contract import (
     Additions,
+    ClockOffset,
     Encoding,
     Extrapolation,
     PlanSettings,
     Prediction,
+    Preview,
     Probe,
     RenderSettings,
     SettingsUsed,
@@ -62,6 +64,8 @@ class Frame(SettingsUsed):
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here
     prediction: Prediction | None = None  # in a stream: how `pose` was foretold; None: it is as it was sent
+    preview: Preview | None = None  # in a stream: how real frames corrected it; None: none did
+    clock: ClockOffset | None = None  # in a stream: time.monotonic() here beside the service's; None: not known yet
 
     def __repr__(self) -> str:
         x, y, z = self.pose[:3, 3]
@@ -154,6 +158,8 @@ def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropp
         dropped=dropped,
         latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
         prediction=from_message(message.prediction, Prediction) if message.HasField("prediction") else None,
+        preview=from_message(message.preview, Preview) if message.HasField("preview") else None,
+        clock=from_message(message.clock, ClockOffset) if message.HasField("clock") else None,
     )
 
 
@@ -239,9 +245,15 @@ def localize_message(
     """The request of a search. Raises InvalidArgument for what is no grey image, and InvalidPose."""
     asked = {"probe": probe, "registration": registration, "within_mm": within_mm, "within_deg": within_deg}
     request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene, start=pose_message(start, field="start"))
+    put_image(request, image)
+    return request
+
+
+def put_image(request: Any, image: npt.ArrayLike | bytes) -> None:
+    """Puts a real frame into a request. Raises InvalidArgument for what is no grey image."""
     if isinstance(image, bytes):
         request.image = image
-        return request
+        return
     pixels = np.asarray(image)
     if pixels.ndim != 2 or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
         raise InvalidArgument(
@@ -255,4 +267,3 @@ def localize_message(
         pixels = np.rint(255.0 * pixels).astype(np.uint8)
     request.image = pixels.tobytes()
     request.image_height, request.image_width = pixels.shape
-    return request

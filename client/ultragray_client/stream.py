@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import grpc
+import numpy.typing as npt
 
 from ultragray_client.connection import Retries, error_of_call
 from ultragray_client.errors import ClientError, StreamEnded
@@ -97,6 +98,7 @@ class FrameStream(_PoseStream):
         self._opening: Any = None
         self._cancelled = False
         self._acknowledgement: Any = None  # to be sent
+        self._real: Any = None  # the newest real frame, likewise
         self._over = False  # no more answers come
         self._open()
         if self._is_latest:
@@ -125,6 +127,19 @@ class FrameStream(_PoseStream):
             self._unsent.append(message)
             self._changed.notify_all()
         return int(message.sequence)
+
+    def send_real(self, image: npt.ArrayLike | bytes, measured_ns: int) -> None:
+        """Sends a frame of the real probe that has come, late: frames are corrected by it, and tell so in `preview`.
+
+        `image`: a PNG file or grey values [H, W], uint8 or floats of 0 to 1, rows along depth, columns across scan
+        lines, not scan-converted. `measured_ns`: when it was taken, by the clock of the poses', between two of them. A
+        newer one takes the place of one that waits here. Raises InvalidArgument; what the service refuses is told as
+        refused settings are.
+        """
+        message = self._exchange.real(image, measured_ns)
+        with self._changed:
+            self._real = message
+            self._changed.notify_all()
 
     def done_sending(self) -> None:
         """No more poses come; the frames of those that were sent still do, then the iteration ends."""
@@ -194,18 +209,21 @@ class FrameStream(_PoseStream):
         """What waits for a call, until another call takes its place, or no more poses come."""
         while True:
             with self._changed:
-                while unsent is self._unsent and not (unsent or self._acknowledgement or self._closed):
+                while unsent is self._unsent and not (unsent or self._acknowledgement or self._real or self._closed):
                     self._changed.wait()
                 if unsent is not self._unsent:
                     return
-                if self._acknowledgement and not (unsent and unsent[0] is self._opening):
+                is_opening = bool(unsent) and unsent[0] is self._opening
+                if self._acknowledgement and not is_opening:
                     message, self._acknowledgement = self._acknowledgement, None
+                elif self._real and not is_opening and (self._is_latest or not unsent):
+                    message, self._real = self._real, None
                 elif unsent:
                     message = unsent.popleft()
                     self._changed.notify_all()
                 else:
                     return
-            yield message
+            yield self._exchange.departing(message)
 
     def _ended(self, call: Any) -> None:
         """Frees senders that wait for a call that is over, where none will follow; reading tells the reason, too."""
@@ -316,6 +334,13 @@ class AsyncFrameStream(_PoseStream):
         await self._send(message)
         return int(message.sequence)
 
+    async def send_real(self, image: npt.ArrayLike | bytes, measured_ns: int) -> None:
+        """Sends a frame of the real probe that has come, late: as `FrameStream.send_real`."""
+        message = self._exchange.real(image, measured_ns)
+        async with self._sending:
+            self._unsent.append(message)
+            await self._send_waiting()
+
     async def done_sending(self) -> None:
         """No more poses come; the frames of those that were sent still do, then the iteration ends."""
         self._closed = True
@@ -397,7 +422,7 @@ class AsyncFrameStream(_PoseStream):
         call = self._call
         try:
             while self._unsent:
-                await self._call.write(self._unsent.popleft())
+                await self._call.write(self._exchange.departing(self._unsent.popleft()))
             if self._closed:
                 await self._call.done_writing()
         except (asyncio.InvalidStateError, StreamEnded, grpc.RpcError):

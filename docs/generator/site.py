@@ -21,7 +21,7 @@ from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
 from ultragray.scene.info import SceneInfo
-from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.bodies import RealFrameHeader, RenderBody, Stamps, StreamMessage
 from ultragray_service.http.routes.streams import FrameMessage
 from ultragray_studies.gym.standard_plane import StandardPlaneSettings
 
@@ -56,6 +56,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "render body": partial(product.keys, RenderBody),
     "slice body": partial(product.keys, SliceSettings),
     "stream messages": partial(product.keys, StreamMessage),
+    "real frames": partial(product.keys, RealFrameHeader),
+    "stamps": partial(product.keys, Stamps),
     "stream settings": partial(product.keys, RenderSettings),
     "stream frames": partial(product.told, FrameMessage),
     "settings": product.settings,

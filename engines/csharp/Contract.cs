@@ -543,6 +543,28 @@ namespace Ultragray
         }
     }
 
+    /// <summary>The client's clock beside the service's, as it is when the answer is sent.</summary>
+    public sealed class ClockOffset : IReadable
+    {
+        /// <summary>Client's time minus service's.</summary>
+        public double OffsetMs { get; set; }
+        /// <summary>The offset is off by no more: half of the fastest round trip, and the standard deviation of the fit.</summary>
+        public double UncertaintyMs { get; set; }
+        /// <summary>What the client's clock gains, microseconds a second.</summary>
+        public double DriftPpm { get; set; }
+        public void Read(JsonReader json)
+        {
+            if (!json.Enter('{')) return;
+            while (json.NextMember())
+            {
+                if (json.Named("offset_ms")) OffsetMs = json.Number();
+                else if (json.Named("uncertainty_ms")) UncertaintyMs = json.Number();
+                else if (json.Named("drift_ppm")) DriftPpm = json.Number();
+                else json.Skip();
+            }
+        }
+    }
+
     /// <summary>Of one frame. None: the scene does not know its training views, has no model, or no coverage was given.</summary>
     public sealed class Extrapolation : IReadable
     {
@@ -621,6 +643,46 @@ namespace Ultragray
         }
     }
 
+    /// <summary>What a frame of a stream that gets real frames shows, and how far to trust it.</summary>
+    public sealed class Preview : IReadable
+    {
+        /// <summary>From the newest real frame to the time of this one.</summary>
+        public double RealAgeMs { get; set; }
+        /// <summary>By the image since then, root mean square.</summary>
+        public double MovedMm { get; set; }
+        /// <summary>It is the late real frame itself: that came nearer to the truth than what is rendered.</summary>
+        public bool IsReal { get; set; }
+        /// <summary>Root mean square of grey values from 0 to 1, as of the last real frames when they came; null: too few have.</summary>
+        public double? ExpectedError { get; set; }
+        /// <summary>Correlation of the structures of the newest real frame and the scene's, -1 to 1.</summary>
+        public double Agreement { get; set; }
+        /// <summary>Confidence times agreement, 0 to 1; null: the scene knows no confidence.</summary>
+        public double? Trust { get; set; }
+        /// <summary>By which the scene was moved to where the real frames show it.</summary>
+        public double OffsetMm { get; set; }
+        /// <summary>Likewise.</summary>
+        public double OffsetDeg { get; set; }
+        /// <summary>The newest real frame is not of the scene there, also after a search about its pose.</summary>
+        public bool Disagrees { get; set; }
+        public void Read(JsonReader json)
+        {
+            if (!json.Enter('{')) return;
+            while (json.NextMember())
+            {
+                if (json.Named("real_age_ms")) RealAgeMs = json.Number();
+                else if (json.Named("moved_mm")) MovedMm = json.Number();
+                else if (json.Named("is_real")) IsReal = json.Flag();
+                else if (json.Named("expected_error")) ExpectedError = json.NumberOrNull();
+                else if (json.Named("agreement")) Agreement = json.Number();
+                else if (json.Named("trust")) Trust = json.NumberOrNull();
+                else if (json.Named("offset_mm")) OffsetMm = json.Number();
+                else if (json.Named("offset_deg")) OffsetDeg = json.Number();
+                else if (json.Named("disagrees")) Disagrees = json.Flag();
+                else json.Skip();
+            }
+        }
+    }
+
     /// <summary>The JSON before the pixels of a frame.</summary>
     public sealed class FrameHeader : IReadable
     {
@@ -630,6 +692,12 @@ namespace Ultragray
         public double? ClientTimeMs { get; set; }
         /// <summary>Poses that newer ones replaced since the answer before.</summary>
         public long Dropped { get; set; }
+        /// <summary>When it is sent, by the service's clock, since 1970.</summary>
+        public double SentMs { get; set; }
+        /// <summary>The client's clock beside the service's; null: not known yet.</summary>
+        public ClockOffset Clock { get; set; }
+        /// <summary>From client_time_ms, when the pose was measured, to sent_ms, across both clocks; null: not known.</summary>
+        public double? AgeMs { get; set; }
         /// <summary>Name.</summary>
         public string Scene { get; set; }
         /// <summary>Of the scene file.</summary>
@@ -682,6 +750,8 @@ namespace Ultragray
         public PixelEncoding Encoding { get; set; }
         /// <summary>How its pose was foretold; null: it is as it was sent.</summary>
         public Prediction Prediction { get; set; }
+        /// <summary>How real frames of the stream corrected it; null: none did.</summary>
+        public Preview Preview { get; set; }
         public void Read(JsonReader json)
         {
             if (!json.Enter('{')) return;
@@ -690,6 +760,9 @@ namespace Ultragray
                 if (json.Named("sequence")) Sequence = json.Integer();
                 else if (json.Named("client_time_ms")) ClientTimeMs = json.NumberOrNull();
                 else if (json.Named("dropped")) Dropped = json.Integer();
+                else if (json.Named("sent_ms")) SentMs = json.Number();
+                else if (json.Named("clock")) Clock = json.Object(Clock);
+                else if (json.Named("age_ms")) AgeMs = json.NumberOrNull();
                 else if (json.Named("scene")) Scene = json.Text(Scene);
                 else if (json.Named("scene_sha256")) SceneSha256 = json.Text(SceneSha256);
                 else if (json.Named("renderer")) Renderer = json.Text(Renderer);
@@ -716,12 +789,13 @@ namespace Ultragray
                 else if (json.Named("outputs")) Outputs = json.Texts(Outputs);
                 else if (json.Named("encoding")) Encoding = (PixelEncoding)json.Word(Words.PixelEncoding);
                 else if (json.Named("prediction")) Prediction = json.Object(Prediction);
+                else if (json.Named("preview")) Preview = json.Object(Preview);
                 else json.Skip();
             }
         }
         internal static readonly string[] Texts = { "scene", "scene_sha256", "renderer", "below_min_confidence", "contact", "speckle", "registration", "encoding" };
         internal static readonly string[] TextLists = { "outputs" };
-        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction" };
+        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "sent_ms", "clock", "age_ms", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction", "preview" };
     }
 
     /// <summary>An error where a call as a whole does not fail.</summary>
@@ -755,6 +829,12 @@ namespace Ultragray
         public double? ClientTimeMs { get; set; }
         /// <summary>Poses that newer ones replaced since the answer before.</summary>
         public long Dropped { get; set; }
+        /// <summary>When it is sent, by the service's clock, since 1970.</summary>
+        public double SentMs { get; set; }
+        /// <summary>The client's clock beside the service's; null: not known yet.</summary>
+        public ClockOffset Clock { get; set; }
+        /// <summary>From client_time_ms, when the pose was measured, to sent_ms, across both clocks; null: not known.</summary>
+        public double? AgeMs { get; set; }
         public Refusal Error { get; set; }
         public void Read(JsonReader json)
         {
@@ -764,6 +844,9 @@ namespace Ultragray
                 if (json.Named("sequence")) Sequence = json.Integer();
                 else if (json.Named("client_time_ms")) ClientTimeMs = json.NumberOrNull();
                 else if (json.Named("dropped")) Dropped = json.Integer();
+                else if (json.Named("sent_ms")) SentMs = json.Number();
+                else if (json.Named("clock")) Clock = json.Object(Clock);
+                else if (json.Named("age_ms")) AgeMs = json.NumberOrNull();
                 else if (json.Named("error")) Error = json.Object(Error);
                 else json.Skip();
             }

@@ -65,13 +65,14 @@ def compressed_image(pixels: Pixels, header: Header) -> CompressedImage:  # [H, 
 def confidence(frame: Frame, header: Header, *, least: float | None, replaced: int) -> DiagnosticArray:
     """How far a frame can be trusted: WARN where its confidence is not known, or below `least`.
 
-    The values are the confidence figures of the frame, its latency in ms, and the poses that it replaced; those that
-    are not known are missing.
+    The values are the confidence figures of the frame, its latency in ms, the poses that it replaced, and how its pose
+    was foretold; those that are not known are missing.
     """
     extrapolation = frame.extrapolation
     known = extrapolation.confidence is not None
     is_fine = extrapolation.confidence is not None and (least is None or extrapolation.confidence >= least)
-    values = {**asdict(extrapolation), "latency_ms": frame.latency_ms, "replaced_poses": replaced}
+    foretold = {} if frame.prediction is None else asdict(frame.prediction)
+    values = {**asdict(extrapolation), "latency_ms": frame.latency_ms, "replaced_poses": replaced, **foretold}
     status = DiagnosticStatus(
         level=DiagnosticStatus.OK if is_fine else DiagnosticStatus.WARN,
         name=f"ultragray: {frame.scene}",

@@ -18,7 +18,8 @@ Tag = TypeVar("Tag")
 class _Request(Generic[Tag]):
     pose: PoseLike
     tag: Tag
-    arrived_ns: int  # of time.monotonic_ns()
+    arrived_ns: int  # of time.monotonic_ns(), likewise:
+    measured_ns: int
     replaced: int  # poses whose place it took
 
 
@@ -36,11 +37,16 @@ class NewestFrames(Generic[Tag]):
         settings: RenderSettings,
         *,
         timeout_s: float,
+        seen_after_ms: float | None = None,
         take: Callable[[Frame, Tag, int], None],
         tell: Callable[[ClientError], None],
     ) -> None:
-        """`timeout_s`: a frame that is older, from the arrival of its pose, is told as DeadlineExceeded."""
+        """`timeout_s`: a frame that is older, from the arrival of its pose, is told as DeadlineExceeded.
+
+        `seen_after_ms`: as of `Client.stream`.
+        """
         self._client, self._timeout_s, self._take, self._tell = client, timeout_s, take, tell
+        self._seen_after_ms = seen_after_ms
         self._wanted = (scene, settings)
         self._changed = threading.Condition()
         self._waiting: _Request[Tag] | None = None
@@ -50,11 +56,13 @@ class NewestFrames(Generic[Tag]):
         self._thread = threading.Thread(target=self._run, name="ultragray-newest", daemon=True)
         self._thread.start()
 
-    def render(self, pose: PoseLike, tag: Tag) -> None:
-        """Ask for the frame of a pose."""
+    def render(self, pose: PoseLike, tag: Tag, age_s: float = 0.0) -> None:
+        """Ask for the frame of a pose; `age_s`: from its stamp to now. One that cannot be is taken for 0."""
+        now_ns = time.monotonic_ns()
+        measured_ns = now_ns - round(1e9 * age_s) if 0.0 <= age_s < self._timeout_s else now_ns
         with self._changed:
             replaced = 0 if self._waiting is None else self._waiting.replaced + 1
-            self._waiting = _Request(pose, tag, time.monotonic_ns(), replaced)
+            self._waiting = _Request(pose, tag, now_ns, measured_ns, replaced)
             self._changed.notify()
 
     def change(self, scene: str, settings: RenderSettings) -> None:
@@ -93,7 +101,7 @@ class NewestFrames(Generic[Tag]):
         left_s = self._left_s(request)
         stream = self._open_stream()
         try:
-            stream.send(request.pose, timeout_s=left_s, measured_ns=request.arrived_ns)
+            stream.send(request.pose, timeout_s=left_s, measured_ns=request.measured_ns)
             frame = stream.receive()
         except ClientError as error:
             if not error.sequence:  # it is about the stream, not about this pose
@@ -117,7 +125,7 @@ class NewestFrames(Generic[Tag]):
         self._end_stream()
         scene, settings = wanted
         # reconnect_s=0: a service that is away is told at once, and the next pose asks again
-        stream = self._client.stream(scene, settings, mode="latest", reconnect_s=0.0)
+        stream = self._client.stream(scene, settings, mode="latest", reconnect_s=0.0, seen_after_ms=self._seen_after_ms)
         with self._changed:
             self._stream, self._streamed = stream, wanted
             if self._closed:  # too late for `close` to see it

@@ -19,6 +19,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from std_msgs.msg import Header
 
 from ultragray_client import Client, Frame, RenderSettings, Tls
@@ -50,6 +51,11 @@ OWN_PARAMETERS: dict[str, tuple[Any, str]] = {
     "rate_hz": (60.0, "of the look-ups, with source tf"),
     "scene_frame": ("scene", "frame of the scene, in which poses are given"),
     "probe_frame": ("probe", "frame of the probe, in which images lie"),
+    "seen_after_ms": (
+        -1.0,
+        "frames are those of where the probe will be so long after they come, foretold by the stamps of poses; "
+        "-1: of the poses as they come",
+    ),
     "timeout_s": (1.0, "frames that are further behind their pose are not published"),
     "autostart": (True, "whether the node configures and activates itself"),
 }
@@ -100,6 +106,7 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             self._value("scene"),
             self._settings,
             timeout_s=self._value("timeout_s"),
+            seen_after_ms=self._value("seen_after_ms") if self._value("seen_after_ms") >= 0.0 else None,
             take=self._publish,
             tell=lambda error: self._problems.tell(error.reason, error.detail),
         )
@@ -188,7 +195,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             return
         self._last_pose = pose
         if self._frames is not None:
-            self._frames.render(messages.placement(pose), pose.header)
+            age_ns = (self.get_clock().now() - Time.from_msg(pose.header.stamp)).nanoseconds
+            self._frames.render(messages.placement(pose), pose.header, age_ns / 1e9)
 
     def _publish(self, frame: Frame, header: Header, replaced: int) -> None:
         if self._topics is None or not self.context.ok():  # told to stop while a frame was under way

@@ -83,6 +83,15 @@ def test_frames_are_those_of_when_they_are_seen(client):
         client.stream("demo", seen_after_ms=-1.0)
 
 
+def test_the_clock_of_the_client_is_told_beside_the_services(client):
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
+        for _ in range(5):
+            stream.send(moved(0.0))
+            frame = stream.receive()
+    ahead_ms = 1e3 * (time.monotonic() - time.time())
+    assert abs(frame.clock.offset_ms - ahead_ms) <= frame.clock.uncertainty_ms + 50.0
+
+
 def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))

@@ -125,6 +125,18 @@ def test_after_a_jump_the_path_begins_anew(jump):
     np.testing.assert_array_equal(path.predict(7.05)[0], after)
 
 
+def test_no_more_than_thirty_millimetres_and_degrees_are_foretold():
+    times = np.arange(0, 3, 0.02)
+    poses = rest(len(times))
+    poses[:, 0, 3] = 200.0 * times
+    poses[:, :3, :3] = rotations_of(np.outer(times, [0.0, 0.0, 1.2]))
+    found, _ = foretold(times, poses, ahead_s=1.0)
+    lengths = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
+    angles = np.linalg.norm(turns_of(poses[:, :3, :3].transpose(0, 2, 1) @ found[:, :3, :3]), axis=1)
+    assert lengths.max() == pytest.approx(30.0)
+    assert np.degrees(angles.max()) == pytest.approx(30.0)
+
+
 def test_no_more_than_a_second_is_foretold():
     times = np.arange(0, 3, 0.02)
     found, told = foretold(times, hand_at(times), ahead_s=60.0)

@@ -33,6 +33,7 @@ _ATTEMPTS = 1024  # that wait for their time: more poses than come in a second, 
 _MEMORY_S = 3.0  # after which a prediction that was tried counts 1/e
 _DOUBT = 2.0  # predictions that came to nothing, which are assumed before any was tried
 _GAP_S = 1.0  # without poses: the path begins anew
+_MOST = np.array([30.0, np.radians(30.0)])  # mm, rad, that a pose is foretold to move
 _JUMP = np.array([30.0, np.radians(30.0)])  # mm, rad off a steady motion: a tracker's jump, likewise
 _RIDGE = 1e-9  # of the normal equations, whose weights are at most 1
 _TINY = 1e-12
@@ -97,7 +98,7 @@ class PathPredictor:
         shares = np.clip(self._agreed / (self._foretold * (1.0 + _DOUBT / max(self._count, _TINY)) + _TINY), 0.0, 1.0)
         left = self._moved - 2.0 * shares * self._agreed + shares**2 * self._foretold  # [K, 2]
         best, parts = left.argmin(axis=0), np.arange(2)
-        shift, turn = shares[best, parts, None] * motions[best, parts]
+        shift, turn = shortened(shares[best, parts, None] * motions[best, parts], _MOST)
         pose = self._pose.copy()
         pose[:3, 3] += shift
         pose[:3, :3] @= rotations_of(turn[None])[0]
@@ -155,6 +156,12 @@ class PathPredictor:
             self._agreed = kept * self._agreed + (attempt.motions * motion).sum(axis=2)
             self._moved = kept * self._moved + (motion**2).sum(axis=1)
             self._count = kept * self._count + 1.0
+
+
+def shortened(motion: FloatArray, most: FloatArray) -> FloatArray:  # [2, 3], [2] -> [2, 3]
+    lengths = np.linalg.norm(motion, axis=1)
+    shorter: FloatArray = motion * np.minimum(1.0, most / np.maximum(lengths, _TINY))[:, None]
+    return shorter
 
 
 def _powers(x: FloatArray) -> FloatArray:  # [...] -> [..., 4]

@@ -416,7 +416,7 @@ class SharedMemory(_message.Message):
     def __init__(self, name: _Optional[str] = ..., token: _Optional[bytes] = ..., slots: _Optional[int] = ..., slot_bytes: _Optional[int] = ..., has_socket: _Optional[bool] = ...) -> None: ...
 
 class RenderStreamRequest(_message.Message):
-    __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns", "window", "acknowledged", "shared_memory", "predict_ms")
+    __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns", "window", "acknowledged", "shared_memory", "predict_ms", "real", "clock")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
@@ -427,6 +427,8 @@ class RenderStreamRequest(_message.Message):
     ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
     SHARED_MEMORY_FIELD_NUMBER: _ClassVar[int]
     PREDICT_MS_FIELD_NUMBER: _ClassVar[int]
+    REAL_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     settings: RenderSettings
     pose: _geometry_pb2.Pose
@@ -437,10 +439,12 @@ class RenderStreamRequest(_message.Message):
     acknowledged: int
     shared_memory: SharedMemory
     predict_ms: float
-    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ..., predict_ms: _Optional[float] = ...) -> None: ...
+    real: RealFrame
+    clock: ClockStamps
+    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ..., predict_ms: _Optional[float] = ..., real: _Optional[_Union[RealFrame, _Mapping]] = ..., clock: _Optional[_Union[ClockStamps, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "prediction", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence", "speckle")
+    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "prediction", "preview", "sent_ns", "clock", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence", "speckle")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     SHARED_DATA_FIELD_NUMBER: _ClassVar[int]
@@ -449,6 +453,9 @@ class Frame(_message.Message):
     DROPPED_FIELD_NUMBER: _ClassVar[int]
     CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
     PREDICTION_FIELD_NUMBER: _ClassVar[int]
+    PREVIEW_FIELD_NUMBER: _ClassVar[int]
+    SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
     RENDERER_FIELD_NUMBER: _ClassVar[int]
@@ -479,6 +486,9 @@ class Frame(_message.Message):
     dropped: int
     client_time_ns: int
     prediction: Prediction
+    preview: Preview
+    sent_ns: int
+    clock: ClockOffset
     scene: str
     scene_sha256: str
     renderer: str
@@ -501,7 +511,7 @@ class Frame(_message.Message):
     min_confidence: float
     below_min_confidence: BelowConfidence
     speckle: Speckle
-    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., prediction: _Optional[_Union[Prediction, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., speckle: _Optional[_Union[Speckle, str]] = ...) -> None: ...
+    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., prediction: _Optional[_Union[Prediction, _Mapping]] = ..., preview: _Optional[_Union[Preview, _Mapping]] = ..., sent_ns: _Optional[int] = ..., clock: _Optional[_Union[ClockOffset, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., speckle: _Optional[_Union[Speckle, str]] = ...) -> None: ...
 
 class Prediction(_message.Message):
     __slots__ = ("ahead_ms", "error_mm", "error_deg")
@@ -512,6 +522,60 @@ class Prediction(_message.Message):
     error_mm: float
     error_deg: float
     def __init__(self, ahead_ms: _Optional[float] = ..., error_mm: _Optional[float] = ..., error_deg: _Optional[float] = ...) -> None: ...
+
+class RealFrame(_message.Message):
+    __slots__ = ("client_time_ns", "image", "image_height", "image_width")
+    CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    client_time_ns: int
+    image: bytes
+    image_height: int
+    image_width: int
+    def __init__(self, client_time_ns: _Optional[int] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ...) -> None: ...
+
+class Preview(_message.Message):
+    __slots__ = ("real_age_ms", "moved_mm", "is_real", "expected_error", "agreement", "trust", "offset_mm", "offset_deg", "disagrees")
+    REAL_AGE_MS_FIELD_NUMBER: _ClassVar[int]
+    MOVED_MM_FIELD_NUMBER: _ClassVar[int]
+    IS_REAL_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_ERROR_FIELD_NUMBER: _ClassVar[int]
+    AGREEMENT_FIELD_NUMBER: _ClassVar[int]
+    TRUST_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_MM_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_DEG_FIELD_NUMBER: _ClassVar[int]
+    DISAGREES_FIELD_NUMBER: _ClassVar[int]
+    real_age_ms: float
+    moved_mm: float
+    is_real: bool
+    expected_error: float
+    agreement: float
+    trust: float
+    offset_mm: float
+    offset_deg: float
+    disagrees: bool
+    def __init__(self, real_age_ms: _Optional[float] = ..., moved_mm: _Optional[float] = ..., is_real: _Optional[bool] = ..., expected_error: _Optional[float] = ..., agreement: _Optional[float] = ..., trust: _Optional[float] = ..., offset_mm: _Optional[float] = ..., offset_deg: _Optional[float] = ..., disagrees: _Optional[bool] = ...) -> None: ...
+
+class ClockStamps(_message.Message):
+    __slots__ = ("answer_sent_ns", "answer_arrived_ns", "sent_ns")
+    ANSWER_SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    ANSWER_ARRIVED_NS_FIELD_NUMBER: _ClassVar[int]
+    SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    answer_sent_ns: int
+    answer_arrived_ns: int
+    sent_ns: int
+    def __init__(self, answer_sent_ns: _Optional[int] = ..., answer_arrived_ns: _Optional[int] = ..., sent_ns: _Optional[int] = ...) -> None: ...
+
+class ClockOffset(_message.Message):
+    __slots__ = ("offset_ms", "uncertainty_ms", "drift_ppm")
+    OFFSET_MS_FIELD_NUMBER: _ClassVar[int]
+    UNCERTAINTY_MS_FIELD_NUMBER: _ClassVar[int]
+    DRIFT_PPM_FIELD_NUMBER: _ClassVar[int]
+    offset_ms: float
+    uncertainty_ms: float
+    drift_ppm: float
+    def __init__(self, offset_ms: _Optional[float] = ..., uncertainty_ms: _Optional[float] = ..., drift_ppm: _Optional[float] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

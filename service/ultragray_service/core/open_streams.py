@@ -15,7 +15,9 @@ from typing import Literal
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
 from ultragray.geometry.motion import Prediction
+from ultragray.rendering.preview import Preview
 from ultragray_service.access.principals import Principal, Role, acting, caller
+from ultragray_service.core.clocks import ClockOffset
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.errors import StreamNotFound
 from ultragray_workers.pool.messages import RenderResult
@@ -30,6 +32,15 @@ class StreamAnswer:
     outcome: RenderResult | UltragrayError
     dropped: int = 0  # poses that were replaced since the answer before
     prediction: Prediction | None = None  # how the pose of the frame was foretold
+    preview: Preview | None = None  # how real frames corrected the frame
+    measured_s: float | None = None  # client_time in seconds
+    clock: ClockOffset | None = None  # of the client, as it was known when the answer was sent
+
+    def age_ms(self, at_s: float) -> float | None:
+        """The age of the pose at a time of the service, s; None: not known."""
+        if self.measured_s is None or self.clock is None:
+            return None
+        return round(1e3 * (at_s - self.measured_s) + self.clock.offset_ms, 3)
 
 
 # The streams that are open at this service, and who watches them.

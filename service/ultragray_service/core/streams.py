@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 from typing import Any, Protocol
@@ -14,8 +14,11 @@ from typing import Any, Protocol
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.preview import Preview
 from ultragray.rendering.settings import RenderSettings
+from ultragray_service.core.clocks import ClientClock, ClockStamps, service_time_s
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
+from ultragray_service.core.previews import RealFrame, StreamPreview
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult
@@ -23,7 +26,8 @@ from ultragray_workers.pool.waiting import Turn
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
-MAX_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket or through a socket of the host
+MAX_MESSAGE_BYTES = 2**21  # of a client, on a WebSocket or through a socket of the host; of one with a real frame
+MAX_POSE_BYTES = 2**16  # of one without
 MAX_WINDOW = 16  # answers of a latest stream that its client may have yet to acknowledge
 
 _log = logging.getLogger("ultragray.stream")
@@ -36,16 +40,21 @@ class StreamMode(str, Enum):
     LATEST = "latest"  # the newer pose takes its place in the queue; it gets no frame, and is counted
 
 
+Correct = Callable[[RenderResult], Awaitable[tuple[RenderResult, Preview | None]]]
+
+
 @dataclass(frozen=True, eq=False)
 class PoseRequest:
     """One pose of a client, checked."""
 
     sequence: int
     client_time: float | None  # any number (an int for gRPC): the client gets it back
+    measured_s: float | None  # the same in seconds
     plan: Plan  # the same object until the client sends other settings
     pose: FloatArray  # [4, 4] mm, exact
     prediction: Prediction | None  # how the pose was foretold; None: it is as the client sent it
     deadline: float  # time.monotonic() in seconds
+    correct: Correct | None = None  # by the real frames of the stream
 
 
 Write = Callable[[StreamAnswer], Awaitable[None]]
@@ -117,6 +126,7 @@ class PoseStream:
     def __init__(self, rendering: Rendering, record: OpenStream | None = None) -> None:
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
+        self.clock = ClientClock()
         self._rendering = rendering
         self._record = record or OpenStream()
         self._room = _Room()
@@ -208,7 +218,7 @@ class PoseStream:
         while (underway := await self._answers.get()) is not None:
             answer = await underway.work
             dropped, self._dropped = self._dropped, 0
-            answer = replace(answer, dropped=dropped)
+            answer = replace(answer, dropped=dropped, clock=self.clock.offset(service_time_s()))
             self._record.note(answer)
             write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
             await write(answer)
@@ -221,15 +231,29 @@ class PoseStream:
         self._answers.put_nowait(_Underway(task, sent))
 
     async def _answer(self, request: PoseRequest) -> StreamAnswer:
-        return _answer_to(request, await self._outcome(self._rendered(request)))
+        return await self._answer_to(request, await self._outcome(self._rendered(request)))
+
+    async def _answer_to(self, request: PoseRequest, outcome: RenderResult | UltragrayError) -> StreamAnswer:
+        answer = StreamAnswer(
+            request.sequence,
+            request.client_time,
+            outcome,
+            prediction=request.prediction,
+            measured_s=request.measured_s,
+        )
+        if request.correct is None or isinstance(outcome, UltragrayError):
+            return answer
+        shown, preview = await request.correct(outcome)
+        return replace(answer, outcome=shown, preview=preview)
 
     async def _rendered(self, request: PoseRequest) -> RenderResult:
         await self._rendering.limits.frame_turn(request.deadline)
         return await self._render(request, Turn())
 
     async def _render(self, request: PoseRequest, turn: Turn) -> RenderResult:
+        destination = self.destination if request.correct is None else None  # its pixels are made here
         return await self._rendering.render(
-            request.plan, request.pose[None], deadline=request.deadline, turn=turn, destination=self.destination
+            request.plan, request.pose[None], deadline=request.deadline, turn=turn, destination=destination
         )
 
     async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
@@ -248,7 +272,11 @@ class PoseStream:
         if self._is_waiting:
             self._current = request
             return True
-        if current is None or current.plan is not request.plan:
+        if (
+            current is None
+            or current.plan is not request.plan
+            or (current.correct is None) != (request.correct is None)
+        ):
             return False
         if not self._turn.give_to(request.pose[None], request.deadline):
             return False
@@ -270,7 +298,7 @@ class PoseStream:
         request, self._current = self._current, None  # perhaps a later one than at the start
         self._window.enter(request.sequence)
         self._advance()
-        return _answer_to(request, outcome)
+        return await self._answer_to(request, outcome)
 
     async def _rendered_latest(self) -> RenderResult:
         self._is_waiting = True
@@ -288,10 +316,6 @@ class PoseStream:
     def _count_dropped(self) -> None:
         self._dropped += 1
         self._rendering.metrics.count_dropped()
-
-
-def _answer_to(request: PoseRequest, outcome: RenderResult | UltragrayError) -> StreamAnswer:
-    return StreamAnswer(request.sequence, request.client_time, outcome, prediction=request.prediction)
 
 
 def unexpected(error: Exception) -> UltragrayError:
@@ -326,9 +350,11 @@ class Message:
     asks: bool = True  # for a frame
     pose: Callable[[], FloatArray]  # [4, 4] mm, exact
     timeout_s: Callable[[], float | None] = nothing  # that the pose may wait; None: the default of the service
-    # When the pose was measured, and for how much later its frame is to be, both in seconds of the client's clock.
-    # None: for the pose as it was measured.
-    predict_s: Callable[[], tuple[float, float] | None] = nothing
+    measured_s: float | None = None  # when the pose was, by the client's clock; there where there is an `ahead_s`
+    ahead_s: Callable[[], float | None] = nothing  # how much later its frame is to be; None: for the pose as it was
+    real: Callable[[], RealFrame | None] = nothing  # a real frame, which came late
+    stamps: ClockStamps | None = None
+    arrived_s: float = field(default_factory=service_time_s)
 
 
 def unreadable(error: UltragrayError, *, of_settings: bool = False, **numbers: Any) -> Message:
@@ -373,12 +399,16 @@ class FrameStream:
         self._rendering, self._transport, self._unset = rendering, transport, unset
         self._plan: Plan | None = None
         self._poses_of: tuple[str, str | None] | None = None  # scene, and registration that leads into it
-        self._path = PathPredictor()  # of the placed poses
+        self._path = PathPredictor()  # of the placed poses, likewise:
+        self._preview = StreamPreview(rendering)
         self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
         """Until the client has sent its last message and got its last frame. Raises Draining when the service stops."""
-        await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
+        try:
+            await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
+        finally:
+            await self._preview.close()
 
     async def _read(self) -> None:
         mode = None
@@ -387,6 +417,8 @@ class FrameStream:
                 self._poses.mode, self._poses.destination = mode, self._transport.destination
                 if message.window is not None:
                     self._poses.open_window(message.window)
+            if message.stamps is not None:
+                self._poses.clock.observe(message.stamps, message.arrived_s)
             if message.acknowledged is not None:
                 self._poses.acknowledge(message.acknowledged)
             await self._take(message)
@@ -404,6 +436,8 @@ class FrameStream:
 
     async def _asked(self, message: Message) -> PoseRequest | None:
         await self._change_settings(message)
+        if (real := message.real()) is not None:
+            await self._preview.take(real, self._plan)
         if not message.asks:
             return None
         if self._plan is None:
@@ -412,11 +446,25 @@ class FrameStream:
             self._plan = await self._resolve(self._unset)
         deadline = self._rendering.planner.deadline(message.timeout_s())
         pose, prediction = self._plan.placed(message.pose()), None
-        if (times_s := message.predict_s()) is not None:
-            measured_s, ahead_s = times_s
-            self._path.observe(measured_s, pose)
-            pose, prediction = self._path.predict(measured_s + ahead_s)
-        return PoseRequest(message.sequence, message.client_time, self._plan, pose, prediction, deadline)
+        if message.measured_s is not None:
+            self._preview.note(message.measured_s, pose)
+        if (ahead_s := message.ahead_s()) is not None and message.measured_s is not None:
+            self._path.observe(message.measured_s, pose)
+            pose, prediction = self._path.predict(message.measured_s + ahead_s)
+        correct, corrected = None, pose
+        if self._preview.is_on and message.measured_s is not None:
+            seen_s = message.measured_s + (0.0 if prediction is None else prediction.ahead_ms / 1e3)
+            correct, corrected = partial(self._preview.shown, pose=pose, at_s=seen_s), self._preview.corrected(pose)
+        return PoseRequest(
+            message.sequence,
+            message.client_time,
+            message.measured_s,
+            self._plan,
+            corrected,
+            prediction,
+            deadline,
+            correct,
+        )
 
     async def _change_settings(self, message: Message) -> None:
         unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
@@ -428,6 +476,8 @@ class FrameStream:
             scene, request = settings
             if self._poses_of != (scene, request.registration):
                 self._poses_of, self._path = (scene, request.registration), PathPredictor()
+                await self._preview.close()
+                self._preview = StreamPreview(self._rendering)
 
     async def _resolve(self, settings: SceneSettings) -> Plan:
         scene, request = settings
@@ -436,16 +486,15 @@ class FrameStream:
         )
 
 
-def times_to_predict(client_time: float | None, per_s: float, predict_ms: float, name: str) -> tuple[float, float]:
-    """`Message.predict_s` of a client's numbers; `per_s`: units of `client_time`, whose field is `name`, in a second.
-
-    Raises InvalidArgument.
-    """
+def ahead_s(client_time: float | None, predict_ms: float | None, name: str) -> float | None:
+    """`Message.ahead_s` of a client's numbers; `name`: the field of `client_time`. Raises InvalidArgument."""
+    if predict_ms is None:
+        return None
     if not 0.0 <= predict_ms <= MAX_AHEAD_MS:
         raise InvalidArgument(f"predict_ms must be from 0 to {MAX_AHEAD_MS:g}, got {predict_ms:g}", field="predict_ms")
     if client_time is None:
         raise InvalidArgument(f"{name} must be given beside predict_ms: when the pose was measured", field=name)
-    return client_time / per_s, predict_ms / 1e3
+    return predict_ms / 1e3
 
 
 def checked_s(name: str, milliseconds: float) -> float:

@@ -29,6 +29,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
+from ultragray_service.core.clocks import ClockStamps
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
@@ -336,6 +337,33 @@ class RenderBody(FrameSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stamps(Contract):
+    """What aligns the clocks of client and service: the newest answer that has come, and when this message goes."""
+
+    answer_sent_ms: float = described("The answer's sent_ms.")
+    answer_arrived_ms: float = described("When it came, by the client's clock, that of client_time_ms.")
+    sent_ms: float = described("When this message is sent, by the client's clock.")
+
+    def in_seconds(self) -> ClockStamps:
+        return ClockStamps(self.answer_sent_ms / 1e3, self.answer_arrived_ms / 1e3, self.sent_ms / 1e3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealFrameHeader(Contract):
+    """What is told of a real frame: rows along depth, columns across scan lines, not scan-converted."""
+
+    client_time_ms: float = described("When it was taken: between those of two poses, whose way led to its own.")
+    image_height: int | None = described(
+        "Of grey pixels of 8 bits, row by row. Default: the image is a PNG file.",
+        None,
+        low=1,
+        high=MAX_IMAGE_SIDE,
+        error=InvalidImageSize,
+    )
+    image_width: int | None = described("Likewise.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StreamMessage(Contract):
     """One message of the client of a WebSocket."""
 
@@ -354,6 +382,12 @@ class StreamMessage(Contract):
         low=0,
         high=MAX_AHEAD_MS,
     )
+    real: RealFrameHeader | None = described(
+        "A real frame that has come, late: the scene's frames are corrected by it. The message is a binary one: length "
+        "of the JSON (uint32, little endian), the JSON, the image.",
+        None,
+    )
+    clock: Stamps | None = described("Aligns the clocks; answers tell their offset then.", None)
     window: int | None = described(
         "Of a latest stream, read from its first message: answers that may wait to be acknowledged. Default: the "
         "client acknowledges none.",

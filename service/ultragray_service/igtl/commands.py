@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 from ultragray.contract import from_dict, shown, to_dict, under
 from ultragray.errors import InvalidArgument, InvalidProbe, UltragrayError
+from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.registration import Registration
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB
@@ -159,6 +160,7 @@ def _plain(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text)
 
 
+_MOST_PATHS = 64  # of devices, which are named by the client
 _DEVICE, _FRAME = "device", "frame"
 _EXAMPLE = '[{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, -120], "device": "NeedleToReference"}]'
 
@@ -235,7 +237,7 @@ def _document(one: ClientTool) -> dict[str, Any]:
 
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0
-_SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools"
+_SCENE, _PROBE, _REGISTRATION, _TOOLS, _PREDICT = "Scene", "Probe", "Registration", "Tools", "PredictMs"
 
 
 @dataclass(frozen=True)
@@ -259,6 +261,12 @@ def _gain_db(text: str) -> float:
     return (percent - _NO_GAIN_PERCENT) * _DB_A_PERCENT
 
 
+def _predict_ms(text: str) -> float:
+    if not 0.0 <= (predict_ms := _number(text)) <= MAX_AHEAD_MS:
+        raise InvalidArgument(f"must be a number from 0 to {MAX_AHEAD_MS:g}, got {shown(text)}")
+    return predict_ms
+
+
 def _number_text(number: float) -> str:
     return f"{number:.10g}"
 
@@ -273,7 +281,7 @@ _DISPLAY: Mapping[str, _DisplayParameter] = {
         "tgc_db", lambda text: tuple(map(_number, text.split())), lambda gains: " ".join(map(_number_text, gains))
     ),
 }
-PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _TOOLS)
+PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _TOOLS, _PREDICT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,6 +291,7 @@ class Setup:
     settings: FrameSettings
     registration: str | None = None  # that leads the poses of devices into the scene
     tools: ClientTools = field(default_factory=ClientTools)
+    predict_ms: float | None = None  # how much later than its stamp the frame of a pose is to be; None: as it was
 
 
 class Scanner:
@@ -290,6 +299,17 @@ class Scanner:
 
     def __init__(self, scenes: SceneChooser, registrations: Registrations, setup: Setup) -> None:
         self.setup, self._scenes, self._registrations = setup, scenes, registrations
+        self._paths: dict[str, PathPredictor] = {}  # by device
+
+    def foretell(self, device: str, measured_s: float, pose: FloatArray) -> tuple[FloatArray, Prediction | None]:
+        """Where a device will be by the time of its frame, [4, 4] mm in its own frame as the pose is."""
+        if self.setup.predict_ms is None:
+            return pose, None
+        if device not in self._paths and len(self._paths) == _MOST_PATHS:
+            self._paths.clear()
+        path = self._paths.setdefault(device, PathPredictor())
+        path.observe(measured_s, pose)
+        return path.predict(measured_s + self.setup.predict_ms / 1e3)
 
     def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
         self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
@@ -304,6 +324,9 @@ class Scanner:
             self.setup = replace(self.setup, registration=value or None)
         elif parameter == _TOOLS:
             self.setup = replace(self.setup, tools=read_tools(value, self.setup.tools))
+        elif parameter == _PREDICT:
+            self._paths.clear()
+            self.setup = replace(self.setup, predict_ms=_predict_ms(value) if value else None)
         elif parameter == _PROBE:
             self._set(probe=_probe(value))
         else:
@@ -322,6 +345,8 @@ class Scanner:
             return self.setup.registration or ""
         if parameter == _TOOLS:
             return json.dumps([_document(one) for one in self.setup.tools.tools])
+        if parameter == _PREDICT:
+            return "" if self.setup.predict_ms is None else _number_text(self.setup.predict_ms)
         if parameter == _PROBE:
             probe = self.setup.settings.probe
             text = None if probe is None else json.dumps(to_dict(probe, with_none=False))

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from ultragray.errors import UltragrayError
 from ultragray.rendering.settings import FrameSettings
+from ultragray_service.core.clocks import service_time_s
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
@@ -34,7 +35,15 @@ from ultragray_service.igtl.contents import (
     unpack_video_query,
 )
 from ultragray_service.igtl.frames import Feed, Frame, PoseMessage, Underway, WaitingPoses, render_frame
-from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
+from ultragray_service.igtl.messages import (
+    HEADER_BYTES,
+    TICKS_PER_S,
+    Header,
+    Message,
+    pack_message,
+    unpack_header,
+    unpack_message,
+)
 from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.igtl.video import VideoEncoder
 from ultragray_service.service import Service
@@ -204,11 +213,14 @@ class Connection:
         if message.type_name in _MANY_POSES:
             named = [(name, pose) for name, pose in of_probes if await self._scenes.named(name) is not None]
             of_probes = named or of_probes[:1]
+        measured_s = message.timestamp / TICKS_PER_S or service_time_s()
         for device_name, pose in of_tools:
             self._scanner.move(device_name, pose)
         for device_name, pose in of_probes:
             self.record.count_pose()
-            self._newest = PoseMessage(replace(message, device_name=device_name), pose, arrived)
+            there, prediction = self._scanner.foretell(device_name, measured_s, pose)
+            about = replace(message, device_name=device_name)
+            self._newest = PoseMessage(about, there, arrived, prediction=prediction)
             if self._poses.put(self._newest, self._service.planner.deadline(None), self._scanner.setup):
                 self._service.metrics.count_dropped()
         if of_tools and not of_probes and self._newest is not None:

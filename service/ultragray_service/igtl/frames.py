@@ -13,10 +13,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from ultragray.geometry.motion import Prediction
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import Registration
 from ultragray.rendering.display import true_to_scale
 from ultragray.rendering.settings import Encoding, Resolved, settings_used
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
@@ -47,6 +49,7 @@ class PoseMessage:
     pose: FloatArray
     arrived: float  # time.perf_counter(), s
     replaced: int = 0  # poses of the device that were dropped for this one
+    prediction: Prediction | None = None  # how the pose was foretold
 
 
 @dataclass(eq=False)
@@ -170,10 +173,16 @@ class Frame:
             **_settings_texts(result.settings),
             **placing,
             "replaced_poses": str(self.posed.replaced),
-            **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
+            **_texts(self.posed.prediction),
+            **_texts(result.extrapolations[0]),
             "queue_ms": f"{result.queue_ms:.3f}",
             "render_ms": f"{result.render_ms:.3f}",
         }
+
+
+def _texts(told: Extrapolation | Prediction | None) -> dict[str, str]:
+    known = {} if told is None else asdict(told)
+    return {name: f"{value:.3f}" for name, value in known.items() if value is not None}
 
 
 @lru_cache(maxsize=256)

@@ -19,11 +19,12 @@ _METADATA_COUNT = struct.Struct(">H")
 _METADATA_ENTRY = struct.Struct(">HHI")
 _UTF8 = 106  # the number of the character set at IANA
 _VERSIONS = (1, 2)
+TICKS_PER_S = 2**32  # of timestamps
 
 
 @dataclass(frozen=True)
 class Header:
-    """The first 58 bytes of a message. `timestamp` counts 2⁻³² s since 1970; 0: none."""
+    """The first 58 bytes of a message. `timestamp` counts ticks since 1970; 0: none."""
 
     version: int
     type_name: str

@@ -18,13 +18,16 @@ from google.protobuf.message import DecodeError
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
 from ultragray.geometry.probe import FloatArray
+from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.volumes import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
+from ultragray_service.core.clocks import ClockStamps, service_time_s
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.core.poses import check_pose_count, exact_poses
+from ultragray_service.core.previews import RealFrame
 from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import (
     MAX_MESSAGE_BYTES,
@@ -32,8 +35,8 @@ from ultragray_service.core.streams import (
     FrameStream,
     Message,
     StreamMode,
+    ahead_s,
     checked_s,
-    times_to_predict,
     unreadable,
 )
 from ultragray_service.errors import Refusal
@@ -99,11 +102,17 @@ class CallTransport:
 
         client_time_ns = message.client_time_ns if has("client_time_ns") else None
 
-        def predict_s() -> tuple[float, float] | None:
-            if not has("predict_ms"):
+        def real() -> RealFrame | None:
+            if not has("real"):
                 return None
-            return times_to_predict(client_time_ns, 1e9, message.predict_ms, "client_time_ns")
+            frame = message.real
+            height, width = (
+                getattr(frame, side) if frame.HasField(side) else None for side in ("image_height", "image_width")
+            )
+            return RealFrame(EncodedFrame(frame.image, height, width), frame.client_time_ns / 1e9)
 
+        predict_ms = message.predict_ms if has("predict_ms") else None
+        clock = message.clock
         return Message(
             sequence=message.sequence,
             client_time=client_time_ns,
@@ -111,10 +120,17 @@ class CallTransport:
             window=message.window or None,
             acknowledged=message.acknowledged if has("acknowledged") else None,
             settings=lambda: read_settings(message) if has("settings") else None,
-            asks=has("pose") or not (has("settings") or has("acknowledged")),
+            asks=has("pose") or not (has("settings") or has("acknowledged") or has("real")),
             pose=pose,
             timeout_s=timeout_s,
-            predict_s=predict_s,
+            measured_s=None if client_time_ns is None else client_time_ns / 1e9,
+            ahead_s=lambda: ahead_s(client_time_ns, predict_ms, "client_time_ns"),
+            real=real,
+            stamps=(
+                ClockStamps(clock.answer_sent_ns / 1e9, clock.answer_arrived_ns / 1e9, clock.sent_ns / 1e9)
+                if has("clock")
+                else None
+            ),
         )
 
     def _begun(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
@@ -137,7 +153,9 @@ class CallTransport:
         return mode
 
     async def send(self, answer: StreamAnswer) -> None:
-        about: dict[str, Any] = {"dropped": answer.dropped}
+        about: dict[str, Any] = {"dropped": answer.dropped, "sent_ns": round(1e9 * service_time_s())}
+        if answer.clock is not None:
+            about["clock"] = to_message(answer.clock, rendering_pb2.ClockOffset)
         if answer.client_time is not None:
             about["client_time_ns"] = int(answer.client_time)
         message: rendering_pb2.Frame | bytes
@@ -147,6 +165,8 @@ class CallTransport:
         else:
             if answer.prediction is not None:
                 about["prediction"] = to_message(answer.prediction, rendering_pb2.Prediction)
+            if answer.preview is not None:
+                about["preview"] = to_message(answer.preview, rendering_pb2.Preview)
             message = serialized_frame(answer.outcome, answer.sequence, **about)
         await (self._context if self._socket is None else self._socket).write(message)
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ultragray.contract import described
-from ultragray.errors import InvalidArgument, RenderFailed
+from ultragray.errors import RenderFailed
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.learn.planning.settings import PlanSettings, ViewPlan
 from ultragray.rendering.settings import Encoding, FrameSettings
@@ -20,6 +21,7 @@ from ultragray.scene.info import SceneHeader
 from ultragray_service.access.audit import account
 from ultragray_service.access.principals import caller
 from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.previews import FRAMES_OF_A_SEARCH
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
@@ -71,9 +73,6 @@ def _assess(header: SceneHeader, poses: FloatArray, probe: Probe | None) -> list
     return Assessor(header.info, header.training_poses).assess(poses, probe)
 
 
-FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Located:
     """Where a real frame was taken, and how certain that is."""
@@ -116,11 +115,7 @@ class Located:
 
 
 def sought_frame(image: bytes, height: int | None, width: int | None, settings: LocalizationSettings) -> Sought:
-    if (height is None) != (width is None):
-        raise InvalidArgument(
-            "image_height and image_width go together: both for grey pixels, neither for a PNG file",
-            field="image_height" if height is None else "image_width",
-        )
+    EncodedFrame(image, height, width)  # its check
     return Sought(image, settings, None if height is None or width is None else (height, width))
 
 

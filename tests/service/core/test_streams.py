@@ -74,10 +74,13 @@ class Faulty:
     """A message whose reading meets a fault of the service."""
 
     sequence, client_time, asks = 7, 1.5, True
-    window = acknowledged = None
+    window = acknowledged = stamps = None
 
     def mode(self):
         return StreamMode.ORDERED
+
+    def real(self):
+        return None
 
     def settings(self):
         raise OverflowError("cannot convert float infinity to integer")

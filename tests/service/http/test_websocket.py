@@ -4,6 +4,7 @@ import contextlib
 import json
 import socket
 import struct
+import time
 from dataclasses import fields
 
 import numpy as np
@@ -14,6 +15,7 @@ from websockets.sync.client import connect
 
 from ultragray_client import Client
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.core.streams import MAX_MESSAGE_BYTES, MAX_POSE_BYTES
 from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
 
 from ...waiting import wait_until
@@ -97,6 +99,72 @@ def test_a_frame_is_that_of_where_the_probe_will_be(open_stream):
     ):
         stream.send(sequence=61, pose=at(0.0), **message)
         assert stream.receive()[0]["error"]["field"] == field
+
+
+def test_clocks_are_aligned_by_the_messages_that_come_anyway(open_stream):
+    stream, ahead_ms = open_stream(), 37_000.0
+
+    def client_ms():  # of a clock that is ahead of the service's, which has that of this host
+        return 1e3 * time.time() + ahead_ms
+
+    about, _ = stream.ask(pose=at(0.0), client_time_ms=client_ms())
+    assert (about["clock"], about["age_ms"]) == (None, None)
+    for _ in range(10):
+        arrived_ms = client_ms()
+        stamps = {"answer_sent_ms": about["sent_ms"], "answer_arrived_ms": arrived_ms, "sent_ms": client_ms()}
+        about, _ = stream.ask(pose=at(0.0), client_time_ms=client_ms() - 250.0, clock=stamps)
+    assert abs(about["clock"]["offset_ms"] - ahead_ms) <= about["clock"]["uncertainty_ms"] + 50.0
+    assert about["age_ms"] + about["clock"]["uncertainty_ms"] >= 250.0
+    stream.send(pose={"matrix": [[1.0]]})
+    assert stream.receive()[0]["clock"]["offset_ms"] == pytest.approx(ahead_ms, abs=100.0)
+
+
+def test_late_real_frames_correct_what_the_scene_shows_at_present(open_stream):
+    """The real probe's frames have half the scene's contrast and a mark, which goes along with it."""
+    stream, frames, previews = open_stream(), [], []
+
+    def real(k):
+        image = frames[k].copy() // 2 + 40
+        image[4:10, 4:10] = 250
+        return image
+
+    for k in range(60):
+        about, data = stream.ask(sequence=k, pose=at(0.0), client_time_ms=50.0 * k)
+        frames.append(np.frombuffer(data, np.uint8).reshape(HEIGHT, WIDTH) if about["preview"] is None else frames[-1])
+        if about["preview"] is not None:
+            previews.append(about["preview"])
+            break
+        header = {"client_time_ms": 0.0, "image_height": HEIGHT, "image_width": WIDTH}
+        message = json.dumps({"real": header}).encode()
+        stream.connection.send(len(message).to_bytes(4, "little") + message + real(0).tobytes())
+    shown = np.frombuffer(data, np.uint8).reshape(HEIGHT, WIDTH)
+    assert np.abs(shown.astype(int) - real(0)).max() <= 3
+    assert previews[0]["agreement"] > 0.5
+    assert not previews[0]["disagrees"]
+    assert previews[0]["moved_mm"] == 0.0
+    assert previews[0]["real_age_ms"] == 50.0 * about["sequence"]
+
+
+@pytest.mark.parametrize(
+    ("real", "image", "settings", "why"),
+    [
+        ({"client_time_ms": 1e6}, b"", {}, "between those of poses"),
+        ({"client_time_ms": 5.0}, b"no picture", {}, "PNG"),
+        ({"client_time_ms": 5.0, "image_height": 2, "image_width": 2}, b"123", {}, "4 bytes of grey pixels, got 3"),
+        ({"client_time_ms": 5.0, "image_height": 2}, b"123", {}, "go together"),
+        ({"client_time_ms": 5.0}, b"", {"outputs": ["echo"]}, "bmode alone"),
+    ],
+)
+def test_a_real_frame_that_cannot_be_compared_is_refused(open_stream, real, image, settings, why):
+    stream = open_stream()
+    for k in range(2):
+        stream.ask(pose=at(0.0), client_time_ms=10.0 * k, settings=settings)
+    message = json.dumps({"sequence": 7, "real": real}).encode()
+    stream.connection.send(len(message).to_bytes(4, "little") + message + image)
+    about, _ = stream.receive()
+    assert about["sequence"] == 7
+    assert why in about["error"]["detail"]
+    assert stream.ask(pose=at(0.0))[1]
 
 
 def test_another_registration_or_scene_begins_another_path(open_stream):
@@ -190,7 +258,9 @@ def test_pages_of_other_sites_are_refused(service, origin):
 
 def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream):
     stream, other = open_stream(), open_stream()
-    stream.connection.send("x" * 70_000)
+    about, _ = stream.ask(name="x" * MAX_POSE_BYTES)
+    assert f"at most {MAX_POSE_BYTES} bytes" in about["error"]["detail"]
+    stream.connection.send("x" * (MAX_MESSAGE_BYTES + 1))
     with pytest.raises(ConnectionClosed, match="1009"):
         stream.receive()
     assert other.ask(pose=at(0.0))[1]
@@ -249,7 +319,7 @@ def test_a_watcher_sees_each_frame_as_the_client_gets_it(service, http, robot):
         for sequence in range(1, POSES + 1):
             own, pixels = step(robot, sequence, sequence / 10)
             seen, passed_on = shown(watcher)
-            assert seen == own
+            assert {**seen, "sent_ms": own["sent_ms"]} == own
             assert passed_on == pixels
     assert streams(http, scene="demo")
     assert streams(http, scene="another") == []

@@ -22,6 +22,7 @@ from ultragray_service.igtl.commands import (
     unpack_command,
 )
 from ultragray_service.igtl.contents import unpack_image, unpack_status
+from ultragray_service.igtl.messages import TICKS_PER_S
 
 from ...documents.tables import code, rows
 from ..conftest import DEMO_PROBE
@@ -97,6 +98,23 @@ def test_gain_range_and_compensation_are_those_of_the_display_settings(peer, igt
     assert not np.array_equal(pixels, over_grpc(igtl_service, "demo", moved(1)))
 
 
+def test_frames_are_those_of_where_a_device_will_be_by_its_time_stamps(peer):
+    set_to(peer, PredictMs="50")
+    for k in range(40):  # 30 mm/s
+        peer.send_pose(moved(0.3 * k), version=2, timestamp=(k + 1) * TICKS_PER_S // 100)
+        foretold = peer.receive()
+    assert foretold.metadata["ahead_ms"] == "50.000"
+    assert float(foretold.metadata["error_mm"]) < 1.5
+    set_to(peer, PredictMs="")
+    peer.send_pose(moved(0.3 * k), version=2)
+    as_sent = peer.receive()
+    assert "ahead_ms" not in as_sent.metadata
+    there, here = (unpack_image(answer.content).matrix[0, 3] for answer in (foretold, as_sent))
+    assert there - here == pytest.approx(1.5, abs=0.2)
+    reply = ask(peer, command("SetUsParameter", ("PredictMs", "1001")))
+    assert reply.get("Error") == "PredictMs: must be a number from 0 to 1000, got '1001'"
+
+
 def test_every_parameter_is_told_as_it_was_set(peer):
     values = {
         "DepthMm": "31.5",
@@ -106,6 +124,7 @@ def test_every_parameter_is_told_as_it_was_set(peer):
         "Scene": "second",
         "Probe": '{"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}',
         "Registration": "",
+        "PredictMs": "80",
         "Tools": "[]",
     }
     assert tuple(values) == PARAMETERS

@@ -263,7 +263,8 @@ export class LiveView {
     if (this.#arrived === null) return;
     const { header, roundTrip_ms } = (this.frame = this.#arrived);
     this.#shown += 1;
-    const took_ms = this.following === null ? roundTrip_ms : header.queue_ms + header.render_ms + header.encode_ms;
+    const cost_ms = header.queue_ms + header.render_ms + header.encode_ms;
+    const took_ms = this.following === null ? roundTrip_ms : (header.age_ms ?? cost_ms);
     this.#latency.shown(took_ms + performance.now() - this.#arrived_ms, performance.now());
     this.following?.shown(this.#arrived);
     this.onshow(this.#arrived);

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,31 @@ from ultragray.rendering.pixels import ByteArray
 SUFFIXES = (".png", ".npy")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SIZE_AT = 16  # bytes of a PNG file, where width and height stand
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedFrame:
+    """A real frame as a message brings it: a PNG file, or, with its size, grey pixels of 8 bits, row by row.
+
+    Rows lie along depth, columns across scan lines, not scan-converted. Raises InvalidArgument for half a size.
+    """
+
+    data: bytes
+    height: int | None = None
+    width: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.height is None) != (self.width is None):
+            raise InvalidArgument(
+                "image_height and image_width go together: both for grey pixels, neither for a PNG file",
+                field="image_height" if self.height is None else "image_width",
+            )
+
+    def pixels(self) -> ByteArray:  # [H, W]
+        """Raises InvalidArgument, InvalidImageSize."""
+        if self.height is None or self.width is None:
+            return read_png(self.data)
+        return read_grey(self.data, self.height, self.width)
 
 
 def read_frame(path: Path) -> Any:  # [H, W]

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial, partialmethod
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
@@ -17,11 +17,23 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.motion import Prediction
+from ultragray.learn.localization.pixels import EncodedFrame
+from ultragray.rendering.preview import Preview
 from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
+from ultragray_service.core.clocks import ClockOffset, service_time_s
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer, StreamSummary, Watcher
 from ultragray_service.core.poses import FrameHeader
-from ultragray_service.core.streams import FrameStream, Message, StreamMode, nothing, times_to_predict, unreadable
+from ultragray_service.core.previews import RealFrame
+from ultragray_service.core.streams import (
+    MAX_POSE_BYTES,
+    FrameStream,
+    Message,
+    StreamMode,
+    ahead_s,
+    nothing,
+    unreadable,
+)
 from ultragray_service.errors import Refusal, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
 from ultragray_service.http.dependencies import SceneName, ServiceDep, problems
@@ -41,6 +53,11 @@ class Answer:
     sequence: int = described("Of the message that it answers.")
     client_time_ms: float | None = described("Likewise.")
     dropped: int = described("Poses that newer ones replaced since the answer before.")
+    sent_ms: float = described("When it is sent, by the service's clock, since 1970.")
+    clock: ClockOffset | None = described("The client's clock beside the service's; null: not known yet.")
+    age_ms: float | None = described(
+        "From client_time_ms, when the pose was measured, to sent_ms, across both clocks; null: not known."
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,6 +65,7 @@ class FrameMessage(FrameHeader, Answer):
     """The JSON before the pixels of a frame."""
 
     prediction: Prediction | None = described("How its pose was foretold; null: it is as it was sent.")
+    preview: Preview | None = described("How real frames of the stream corrected it; null: none did.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,24 +85,31 @@ def frame_bytes(answer: StreamAnswer) -> bytes:
         FrameMessage.of(
             answer.outcome,
             **vars(settings_used(answer.outcome.settings)),
-            sequence=answer.sequence,
-            client_time_ms=answer.client_time,
-            dropped=answer.dropped,
+            **_beginning(answer),
             prediction=answer.prediction,
+            preview=answer.preview,
         )
     )
     header += b" " * (-(4 + len(header)) % _ALIGNMENT)
     return len(header).to_bytes(4, "little") + header + answer.outcome.data
 
 
+def _beginning(answer: StreamAnswer) -> dict[str, Any]:
+    """The fields of an Answer that is sent now."""
+    sent_s = service_time_s()
+    return {
+        "sequence": answer.sequence,
+        "client_time_ms": answer.client_time,
+        "dropped": answer.dropped,
+        "sent_ms": 1e3 * sent_s,
+        "clock": answer.clock,
+        "age_ms": answer.age_ms(sent_s),
+    }
+
+
 def refusal_text(answer: StreamAnswer) -> str:
     assert isinstance(answer.outcome, UltragrayError)
-    message = RefusalMessage(
-        sequence=answer.sequence,
-        client_time_ms=answer.client_time,
-        dropped=answer.dropped,
-        error=Refusal.of(answer.outcome),
-    )
+    message = RefusalMessage(**_beginning(answer), error=Refusal.of(answer.outcome))
     text: bytes = adapter_of(RefusalMessage).dump_json(message)
     return text.decode()
 
@@ -155,22 +180,43 @@ class _Numbers:
 _NUMBERS = TypeAdapter(_Numbers)
 
 
-def _message_of(text: str | None, scene: str) -> Message:
+def _parts(received: str | bytes) -> tuple[str | bytes, bytes]:
+    """The JSON of a message, and the image of a binary one, which is made as those of frames are.
+
+    Raises InvalidArgument.
+    """
+    if isinstance(received, bytes):
+        end = 4 + int.from_bytes(received[:4], "little")
+        text, image = received[4:end], received[end:]
+        if len(received) < end:
+            raise InvalidArgument(f"the JSON of a binary message must have the {end - 4} bytes that its first 4 say")
+    else:
+        text, image = received, b""
+    if len(text) > MAX_POSE_BYTES:
+        raise InvalidArgument(f"the JSON of a message must have at most {MAX_POSE_BYTES} bytes, got {len(text)}")
+    return text, image
+
+
+def _message_of(received: str | bytes, scene: str) -> Message:
+    text: str | bytes = ""
     try:
-        if text is None:
-            raise InvalidArgument("messages must be JSON in text frames, got a binary one")
+        text, image = _parts(received)
         message = read_json(text, StreamMessage)
+        if message.real is None and isinstance(received, bytes):
+            raise InvalidArgument("a binary message must tell of the real frame behind it", field="real")
     except UltragrayError as error:
         try:
-            numbers = _NUMBERS.validate_json(text or "")
+            numbers = _NUMBERS.validate_json(text)
         except (ValueError, RecursionError):
             numbers = _Numbers()
         of_settings = (error.field or "").startswith("settings")
         return unreadable(error, of_settings=of_settings, sequence=numbers.sequence, client_time=numbers.client_time_ms)
     pose, settings, timeout_ms, predict_ms = message.pose, message.settings, message.timeout_ms, message.predict_ms
+    real = message.real
     return Message(
         sequence=message.sequence,
         client_time=message.client_time_ms,
+        measured_s=None if message.client_time_ms is None else message.client_time_ms / 1e3,
         mode=lambda: message.mode or StreamMode.ORDERED,
         window=message.window,
         acknowledged=message.acknowledged,
@@ -178,9 +224,13 @@ def _message_of(text: str | None, scene: str) -> Message:
         asks=pose is not None,
         pose=nothing if pose is None else partial(pose.exact, "pose"),  # type: ignore[arg-type]  # it asks for none
         timeout_s=lambda: None if timeout_ms is None else timeout_ms / 1000.0,
-        predict_s=lambda: (
-            None if predict_ms is None else times_to_predict(message.client_time_ms, 1e3, predict_ms, "client_time_ms")
+        ahead_s=lambda: ahead_s(message.client_time_ms, predict_ms, "client_time_ms"),
+        real=lambda: (
+            None
+            if real is None
+            else RealFrame(EncodedFrame(image, real.image_height, real.image_width), real.client_time_ms / 1e3)
         ),
+        stamps=None if (clock := message.clock) is None else clock.in_seconds(),
     )
 
 
@@ -195,7 +245,8 @@ class _WebSocketTransport:
         received = await self._websocket.receive()
         if received["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(received.get("code", 1005))
-        return _message_of(received.get("text"), self._scene)
+        text, image = received.get("text"), received.get("bytes")
+        return _message_of(image if text is None else text, self._scene)
 
     async def send(self, answer: StreamAnswer, *, hand_over: bool = False) -> None:
         is_refusal = isinstance(answer.outcome, UltragrayError)
