@@ -66,6 +66,7 @@ OPERATIONS = (
     _operation("scene.plan", _READER, "POST /v1/scenes/{scene}:plan", "RenderService/PlanViews"),
     _operation(STREAM, _READER, f"{WEBSOCKET} /v1/scenes/{{scene}}/stream", "RenderService/RenderStream"),
     _operation("stream.list", _READER, "GET /v1/streams"),
+    _operation("stream.correct", _READER, "POST /v1/streams/{stream}/real-frames"),
     _operation(WATCH, _READER, f"{WEBSOCKET} /v1/streams/{{stream}}/watch"),
     _operation("probe.plane", _READER, "POST /v1/probes:plane"),
     _operation("scene.list", _READER, "GET /v1/scenes", "SceneService/ListScenes"),

@@ -6,7 +6,7 @@ import asyncio
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -15,6 +15,7 @@ from typing import Literal
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
 from ultragray.geometry.motion import Prediction
+from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.rendering.preview import Preview
 from ultragray_service.access.principals import Principal, Role, acting, caller
 from ultragray_service.core.clocks import ClockOffset
@@ -75,6 +76,10 @@ class StreamSummary:
     watchers: int
 
 
+# Takes a real frame, by the time that it has, and how old it is: of either one is known. Raises InvalidArgument.
+TakeReal = Callable[[EncodedFrame, float | None, float | None], Awaitable[None]]
+
+
 class _Rate:
     def __init__(self) -> None:
         self._times: deque[float] = deque()
@@ -130,6 +135,7 @@ class OpenStream:
         self._pose_rate, self._frame_rate = _Rate(), _Rate()
         self._newest: RenderResult | None = None
         self._watchers: set[Watcher] = set()
+        self.take_real: TakeReal | None = None  # of streams that real frames may correct
 
     def count_pose(self) -> None:
         self._poses += 1

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray
+from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.rendering.preview import Preview
 from ultragray.rendering.settings import RenderSettings
 from ultragray_service.core.clocks import ClientClock, ClockStamps, service_time_s
@@ -401,6 +402,8 @@ class FrameStream:
         self._poses_of: tuple[str, str | None] | None = None  # scene, and registration that leads into it
         self._path = PathPredictor()  # of the placed poses, likewise:
         self._preview = StreamPreview(rendering)
+        if record is not None:
+            record.take_real = self._take_real
         self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
@@ -465,6 +468,21 @@ class FrameStream:
             deadline,
             correct,
         )
+
+    async def _take_real(self, image: EncodedFrame, measured_s: float | None, age_s: float | None) -> None:
+        """Takes a real frame that does not come by the stream itself: `TakeReal`."""
+        if (measured_s is None) == (age_s is None):
+            raise InvalidArgument("exactly one of client_time_ms and age_ms must be given", field="age_ms")
+        if age_s is not None:
+            now_s = service_time_s()
+            if (offset := self._poses.clock.offset(now_s)) is None:
+                raise InvalidArgument(
+                    "age_ms takes a stream whose messages align the clocks (clock); else give client_time_ms",
+                    field="age_ms",
+                )
+            measured_s = now_s - age_s + offset.offset_ms / 1e3
+        assert measured_s is not None
+        await self._preview.take(RealFrame(image, measured_s), self._plan)
 
     async def _change_settings(self, message: Message) -> None:
         unset, self._unset = self._unset, None  # as long as the message's own are not known to be none

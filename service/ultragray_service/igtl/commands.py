@@ -281,7 +281,7 @@ _DISPLAY: Mapping[str, _DisplayParameter] = {
         "tgc_db", lambda text: tuple(map(_number, text.split())), lambda gains: " ".join(map(_number_text, gains))
     ),
 }
-PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _TOOLS, _PREDICT)
+PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _PREDICT, _TOOLS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -310,6 +310,31 @@ def step(robot, sequence, x, **others):
     return shown(robot)
 
 
+def test_a_real_frame_may_come_from_another_program(service, http, robot):
+    """By its age: the messages of the stream align the clock of the robot, which is 37 s ahead."""
+
+    def ask(sequence, **others):
+        return step(robot, sequence, 0.0, client_time_ms=1e3 * time.time() + 37_000.0, **others)
+
+    about, data = ask(0, settings={"height": HEIGHT, "width": WIDTH})
+    path = f"/v1/streams/{named(http, 'UR5')['id']}/real-frames"
+    size = {"image_height": HEIGHT, "image_width": WIDTH}
+    refused = http.post(path, params={"age_ms": 1, **size}, content=data)
+    assert (refused.status_code, refused.json()["field"]) == (422, "age_ms")
+    for sequence in range(1, 1000):
+        now_ms = 1e3 * time.time() + 37_000.0
+        stamps = {"answer_sent_ms": about["sent_ms"], "answer_arrived_ms": now_ms, "sent_ms": now_ms}
+        about, _ = ask(sequence, clock=stamps)
+        if about["preview"] is not None:
+            break
+        if sequence > 2:
+            http.post(path, params={"age_ms": 5, **size}, content=data).raise_for_status()
+    assert 0.0 < about["preview"]["real_age_ms"] < 60_000.0
+    assert http.post("/v1/streams/none/real-frames", content=b"").status_code == 404
+    both = http.post(path, params={"age_ms": 1, "client_time_ms": 2}, content=b"")
+    assert both.json()["detail"] == "exactly one of client_time_ms and age_ms must be given"
+
+
 def test_a_watcher_sees_each_frame_as_the_client_gets_it(service, http, robot):
     step(robot, 0, 0.0, settings={"height": 40, "width": 30, "outputs": ["bmode", "coverage"]})
     told = named(http, "UR5")

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from functools import partial, partialmethod
 from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Query, Request, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.motion import Prediction
 from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.rendering.preview import Preview
@@ -34,9 +35,9 @@ from ultragray_service.core.streams import (
     nothing,
     unreadable,
 )
-from ultragray_service.errors import Refusal, statuses_of
+from ultragray_service.errors import Refusal, StreamNotFound, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
-from ultragray_service.http.dependencies import SceneName, ServiceDep, problems
+from ultragray_service.http.dependencies import SceneName, ServiceDep, problems, require_uncompressed
 from ultragray_service.http.problems import problem_response
 from ultragray_service.http.protocol import HAND_OVER
 from ultragray_service.service import Service
@@ -185,16 +186,14 @@ def _parts(received: str | bytes) -> tuple[str | bytes, bytes]:
 
     Raises InvalidArgument.
     """
+    begin, end = 0, len(received)
     if isinstance(received, bytes):
-        end = 4 + int.from_bytes(received[:4], "little")
-        text, image = received[4:end], received[end:]
+        begin, end = 4, 4 + int.from_bytes(received[:4], "little")
         if len(received) < end:
             raise InvalidArgument(f"the JSON of a binary message must have the {end - 4} bytes that its first 4 say")
-    else:
-        text, image = received, b""
-    if len(text) > MAX_POSE_BYTES:
-        raise InvalidArgument(f"the JSON of a message must have at most {MAX_POSE_BYTES} bytes, got {len(text)}")
-    return text, image
+    if end - begin > MAX_POSE_BYTES:
+        raise InvalidArgument(f"the JSON of a message must have at most {MAX_POSE_BYTES} bytes, got {end - begin}")
+    return received[begin:end], received[end:] if isinstance(received, bytes) else b""
 
 
 def _message_of(received: str | bytes, scene: str) -> Message:
@@ -245,8 +244,8 @@ class _WebSocketTransport:
         received = await self._websocket.receive()
         if received["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(received.get("code", 1005))
-        text, image = received.get("text"), received.get("bytes")
-        return _message_of(image if text is None else text, self._scene)
+        text: str | None = received.get("text")
+        return _message_of(received["bytes"] if text is None else text, self._scene)
 
     async def send(self, answer: StreamAnswer, *, hand_over: bool = False) -> None:
         is_refusal = isinstance(answer.outcome, UltragrayError)
@@ -278,6 +277,35 @@ async def list_streams(service: ServiceDep, scene: SceneFilter = None) -> Stream
     several services answer at one address, these are the streams of the one that answers.
     """
     return StreamList(service.streams.seen(scene))
+
+
+Milliseconds = Annotated[FiniteFloat | None, Query()]
+Side = Annotated[int | None, Query(ge=1, le=MAX_IMAGE_SIDE, description="Of grey pixels of 8 bits, row by row.")]
+
+
+@streams_router.post("/{stream}/real-frames", status_code=204, responses=problems(401, 404, 413, 422))
+async def put_real_frame(
+    service: ServiceDep,
+    stream: str,
+    request: Request,
+    client_time_ms: Milliseconds = None,
+    age_ms: Milliseconds = None,
+    image_height: Side = None,
+    image_width: Side = None,
+) -> None:
+    """A real frame that has come, late, and not to the program that streams: it corrects the frames of the stream.
+
+    The body is a PNG file, or grey pixels. When the frame was taken tells either `client_time_ms`, by the clock of the
+    stream's poses, or `age_ms`, how long ago that was: then the messages of the stream must align the clocks.
+    """
+    require_uncompressed(request)
+    record, data = service.streams.get(stream), await request.body()
+    if record.take_real is None:
+        raise StreamNotFound(
+            "this stream takes no real frames: WebSockets and calls of RenderStream do", field="stream"
+        )
+    times = (None if time_ms is None else time_ms / 1e3 for time_ms in (client_time_ms, age_ms))
+    await record.take_real(EncodedFrame(data, image_height, image_width), *times)
 
 
 @streams_router.websocket("/{stream}/watch")
