@@ -123,7 +123,8 @@ class StreamPreview:
             shown = await asyncio.to_thread(self._previewer.show, _grey(result), pose)
         data = in_type(shown.frame, result.settings.encoding.pixel_type).tobytes()
         confidence = result.extrapolations[0].confidence
-        offset_mm, offset_deg = self._lengths(self._offset, newest)
+        offset = result.poses[0] @ np.linalg.inv(pose)  # that it was rendered with: perhaps not the newest
+        offset_mm, offset_deg = self._lengths(offset, newest)
         told = Preview(
             real_age_ms=round(1e3 * (at_s - newest.measured_s), 3),
             moved_mm=round(shown.moved_mm, 3),
