@@ -29,6 +29,7 @@ from ultragray.rendering.preview import Preview
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
+from ultragray.scene.edits import Edit
 from ultragray_service.core.clocks import ClockOffset
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
@@ -50,6 +51,7 @@ ROOTS = {
     "DatasetOptions": SourceOptions,
     "Dataset": DatasetRecord,
     "Specification": Specification,
+    "Edit": Edit,
 }
 LEFT_OUT = {"device_set", "calibration"}  # files are uploaded with their dataset
 OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place

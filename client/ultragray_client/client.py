@@ -18,6 +18,7 @@ from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiK
 from ultragray_client.contract import (
     Dataset,
     DatasetOptions,
+    Edit,
     Extrapolation,
     PlanSettings,
     Probe,
@@ -139,6 +140,18 @@ class Scenes(Group[AnyConnection]):
         painted = [scenes_pb2.PaintedFrame(pose=pose_message(pose), labels=labels) for pose, labels in frames]
         request = message_of({**asked, **known}, scenes_pb2.LabelSceneRequest, scene=name, frames=painted)
         return Call("SceneService.LabelScene", request, scene_from_message, timeout_s)
+
+    @operation
+    def edit(
+        self, name: str, edits: Iterable[Edit], *, into: str, private: bool = False, timeout_s: float | None = None
+    ) -> Call[Scene]:
+        """Edits a scene, one edit after another, as the scene `into`, which tells its parents; `name` stays as it is.
+
+        Raises SceneNotFound, SceneExists, and InvalidArgument with the path of what is wrong.
+        """
+        asked = {"into": into, "edits": list(edits), "private": private}
+        request = message_of(asked, scenes_pb2.EditSceneRequest, scene=name)
+        return Call("SceneService.EditScene", request, scene_from_message, timeout_s)
 
 
 class Datasets(Group[AnyConnection]):

@@ -19,24 +19,37 @@ __all__ = [
     "AroundSampler",
     "Below",
     "Box",
+    "BoxShape",
     "ClockOffset",
     "CompareJob",
     "ComparisonSettings",
     "Contact",
     "ConvexProbe",
     "CoveredSampler",
+    "CutEdit",
     "Cylinder",
     "Dataset",
     "DatasetOptions",
     "Display",
+    "Edit",
     "ElevationBeam",
+    "EllipsoidShape",
     "Encoding",
     "EvaluateJob",
     "Extrapolation",
     "FanSampler",
     "FrameSettings",
     "ImageRegion",
+    "Imaging",
+    "InsertEdit",
+    "LabelShape",
+    "LesionsEdit",
     "LinearProbe",
+    "MapShape",
+    "MergeEdit",
+    "MeshShape",
+    "Motion",
+    "MoveEdit",
     "Needle",
     "PhasedProbe",
     "PlanSettings",
@@ -44,20 +57,25 @@ __all__ = [
     "Preview",
     "Probe",
     "RadialProbe",
+    "RelabelEdit",
     "RenderJob",
     "RenderSettings",
     "Sampler",
     "SettingsUsed",
     "Shaft",
+    "Shape",
     "SliceSettings",
     "Specification",
     "Speckle",
+    "SphereShape",
     "SplineSampler",
     "SteeredProbe",
+    "ThinEdit",
     "Tool",
     "ToolFrame",
     "TrainJob",
     "TrainingSampler",
+    "TubeShape",
     "VoxelizeJob",
 ]
 MAX_AHEAD_MS = 1000.0  # that the service foretells a pose
@@ -685,3 +703,175 @@ class VoxelizeJob:
 
 
 Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob | VoxelizeJob
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A rigid motion: a turn about a point, then a shift."""
+
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Along the axes of the scene.
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Axis times angle, degrees, about the axes of the scene.
+    about_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # The point that the turn leaves where it is.
+
+
+@dataclass(frozen=True)
+class SphereShape:
+    """A ball."""
+
+    centre_mm: tuple[float, float, float]  # Its middle.
+    radius_mm: float  # Its radius.
+    kind: Literal["sphere"] = field_of(default="sphere", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class EllipsoidShape:
+    """An ellipsoid; its distance is exact to first order."""
+
+    centre_mm: tuple[float, float, float]  # Its middle.
+    radii_mm: tuple[float, float, float]  # Half its axes.
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Axis times angle, degrees, about the axes of the scene.
+    kind: Literal["ellipsoid"] = field_of(default="ellipsoid", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class BoxShape:
+    """A box along the axes of the scene."""
+
+    min_mm: tuple[float, float, float]  # Its least corner.
+    max_mm: tuple[float, float, float]  # Its greatest corner.
+    kind: Literal["box"] = field_of(default="box", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class TubeShape:
+    """All that lies near a path of straight pieces, such as a vessel."""
+
+    points_mm: tuple[tuple[float, float, float], ...]  # The path, two points or more.
+    radius_mm: float  # Its radius.
+    kind: Literal["tube"] = field_of(default="tube", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class MeshShape:
+    """The inside of a closed surface of triangles."""
+
+    data: str  # A file of the mesh in base64, in mm of the scene's frame.
+    format: str = "stl"  # Of the file.
+    kind: Literal["mesh"] = field_of(default="mesh", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class MapShape:
+    """The voxels of a label in a NIfTI label map. It can be cut out and relabelled, not inserted."""
+
+    data: str  # A NIfTI-1 file in base64, in mm of the scene's frame (RAS+).
+    format: str = "nii.gz"  # Of the file.
+    label: int = 0  # Of the voxels; 0: of all that have one.
+    kind: Literal["map"] = field_of(default="map", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class LabelShape:
+    """The Gaussians of the scene that have a label. It can be cut out and relabelled, not inserted."""
+
+    name: str  # Of the label, as the scene names it.
+    kind: Literal["label"] = field_of(default="label", repr=False, kw_only=True)
+
+
+Shape: TypeAlias = SphereShape | EllipsoidShape | BoxShape | TubeShape | MeshShape | MapShape | LabelShape
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoveEdit(Motion):
+    """Moves the scene with its training poses, or a part of it alone."""
+
+    kind: Literal["move"] = field_of(default="move", repr=False, kw_only=True)
+    shape: Shape | None = None  # The part: Gaussians whose middle lies in it. Default: all, and the poses.
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutEdit:
+    """Keeps the Gaussians whose middle lies inside a shape, or those outside. None is changed."""
+
+    kind: Literal["cut"] = field_of(default="cut", repr=False, kw_only=True)
+    shape: Shape  # Its surface divides the scene.
+    keep: str = "inside"  # Which side stays.
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergeEdit(Motion):
+    """Adds the Gaussians and training poses of another scene, which the motion leads into this one.
+
+    Which of the two shows at a place is decided by whose training images are nearer; where both are near, both show,
+    each with half of its volume. Where neither was cut apart from the other, what was joined is then fitted to frames
+    of both.
+    """
+
+    kind: Literal["merge"] = field_of(default="merge", repr=False, kw_only=True)
+    scene: str  # Name of the other scene.
+    register: bool = False  # Whether the motion is only about right, and frames of the overlap find the rest.
+    match_gain: bool = True  # Whether its echo is made as bright as that of this one in the overlap.
+    # Steps by which what was joined is fitted to frames of both at their training poses; 0: it stays as it is.
+    fit_steps: int = 300
+    seam_mm: float = 1.0  # Width of the passage from one to the other.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaging:
+    """The scanner that decibels become grey values by."""
+
+    frequency_mhz: float = 5.0  # Of the sweep's probe.
+    dynamic_range_db: float = 60.0  # Between black and white of the sweep's frames.
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsertEdit(Imaging):
+    """Puts a body of a tissue into the scene, in the place of what is there.
+
+    Its Gaussians get a label of their own, and the scene file says that they were made. Tissue that attenuates less
+    than soft tissue lets through what reaches it; it brightens nothing behind it.
+    """
+
+    kind: Literal["insert"] = field_of(default="insert", repr=False, kw_only=True)
+    shape: Shape  # The body.
+    tissue: str = "tumour"  # What it consists of.
+    label: str | None = None  # Name of its label. Default: that of the tissue.
+    echo_db: float | None = None  # Over the tissue around. Default: the tissue's.
+    attenuation: float | None = None  # One way, dB/(cm MHz). Default: the tissue's.
+    # Middle of the place of the scene whose texture it gets. Default: one is made, as rough as what is around.
+    texture_from_mm: tuple[float, float, float] | None = None
+    wall_mm: float = 0.0  # Thickness of a bright wall around it, as a vessel has.
+    seed: int = 0  # Of the texture.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LesionsEdit(Imaging):
+    """Inserts bodies at random places that the training images show: training data with masks."""
+
+    kind: Literal["lesions"] = field_of(default="lesions", repr=False, kw_only=True)
+    count: int = 1  # How many.
+    tissues: tuple[str, ...] = ("cyst", "tumour", "calcification")  # Drawn from these.
+    radius_min_mm: float = 2.0  # Of the smallest.
+    radius_max_mm: float = 6.0  # Of the largest; calcifications have a third.
+    seed: int = 0  # Of the random choices.
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelabelEdit:
+    """Gives the Gaussians whose middle lies in one of some shapes a label: a box, a brush of spheres, a label map."""
+
+    kind: Literal["relabel"] = field_of(default="relabel", repr=False, kw_only=True)
+    shapes: tuple[Shape, ...]  # One or more.
+    label: str | None = None  # Its name, known to the scene or new. Default: they lose theirs.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThinEdit:
+    """Leaves out the Gaussians that show least in frames at the training poses."""
+
+    kind: Literal["thin"] = field_of(default="thin", repr=False, kw_only=True)
+    gaussian_count: int | None = None  # How many stay.
+    file_bytes: int | None = None  # Or: how large the scene file may be.
+
+
+Edit: TypeAlias = MoveEdit | CutEdit | MergeEdit | InsertEdit | LesionsEdit | RelabelEdit | ThinEdit

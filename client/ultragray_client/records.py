@@ -72,6 +72,9 @@ class Scene:
     speckle: bool  # whether its frames can have natural speckle
     owner: str | None  # None: nobody
     private: bool  # others do not see it
+    parents: Mapping[str, str]  # SHA-256 by name of the scenes that edits made it of
+    edits: tuple[str, ...]  # what was done to them, each in JSON
+    made_labels: tuple[str, ...]  # of what was put in, and never recorded
 
 
 def entry_from_message(message: scenes_pb2.SceneEntry) -> SceneEntry:

@@ -1033,6 +1033,12 @@ namespace Ultragray
         public string Owner { get; set; }
         /// <summary>Whether others may not see it.</summary>
         public bool Private { get; set; }
+        /// <summary>SHA-256 by name of the scenes that edits made it of; empty: it was trained.</summary>
+        public Dictionary<string, string> Parents { get; set; }
+        /// <summary>What was done to them, each in JSON.</summary>
+        public string[] Edits { get; set; }
+        /// <summary>Names of the labels of what was put in, and never recorded.</summary>
+        public string[] MadeLabels { get; set; }
         public void Read(JsonReader json)
         {
             if (!json.Enter('{')) return;
@@ -1061,6 +1067,9 @@ namespace Ultragray
                 else if (json.Named("speckle")) Speckle = json.Flag();
                 else if (json.Named("owner")) Owner = json.Text(Owner);
                 else if (json.Named("private")) Private = json.Flag();
+                else if (json.Named("parents")) Parents = json.Map(JsonReader.ReadText);
+                else if (json.Named("edits")) Edits = json.Texts(Edits);
+                else if (json.Named("made_labels")) MadeLabels = json.Texts(MadeLabels);
                 else json.Skip();
             }
         }

@@ -20,6 +20,7 @@ from ultragray_service.access.origins import Origins
 from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
+from ultragray_service.core.editing import SceneEdits
 from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
@@ -67,6 +68,7 @@ class Service:
     uploads: DatasetUploads
     imports: SceneImports
     labels: SceneLabels
+    edits: SceneEdits
     # What is made of it.
     pool: RenderPool
     planner: RequestPlanner

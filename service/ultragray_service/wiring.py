@@ -14,6 +14,7 @@ from ultragray_service.access.oidc import Issuer, OidcTokens, parse_roles
 from ultragray_service.access.origins import Origins
 from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.core.datasets import Datasets
+from ultragray_service.core.editing import SceneEdits
 from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
@@ -76,8 +77,9 @@ def make_service(settings: Settings) -> Service:
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
     # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
-    # labels a scene, and one draws thumbnails, which would wait behind pictures for minutes.
-    checks, pictures, labelling, thumbnails = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(4))
+    # labels a scene, one edits scenes, and one draws thumbnails, which would wait behind pictures for minutes.
+    memory_bytes = settings.dataset_memory_mb << 20
+    checks, pictures, labelling, editing, thumbnails = (HelperProcesses(memory_bytes) for _ in range(5))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
     imports = SceneImports(scenes, places.made, means)
     return Service(
@@ -103,6 +105,7 @@ def make_service(settings: Settings) -> Service:
         uploads=DatasetUploads(datasets, means),
         imports=imports,
         labels=SceneLabels(scenes, imports, registrations, owners, labelling, life),
+        edits=SceneEdits(scenes, imports, owners, editing, life),
         pool=pool,
         planner=planner,
         rendering=rendering,

@@ -32,9 +32,9 @@ def label_scene(
     file that the output will take the place of: it may differ in its labels alone.
     Raises what `label_by_frames`, `label_by_map` and `read_label_map` raise, SceneFileInvalid, and SceneExists.
     """
-    from ultragray.exchange.label_maps import read_label_map
     from ultragray.learn.labelling import PaintedFrame, label_by_frames, label_by_map, same_but_for_labels
     from ultragray.scene.gaussians import GaussianScene
+    from ultragray.scene.label_maps import read_label_map
 
     loaded = GaussianScene.load(scene)
     if replaced is not None and not same_but_for_labels(loaded, GaussianScene.load(replaced)):

@@ -16,7 +16,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once
 from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.confidence import SupportWatch, supported_shares
-from ultragray.rendering.frames import render, render_shown
+from ultragray.rendering.frames import recorded_coverage, render_shown
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import PixelArray
 from ultragray.rendering.settings import Resolved
@@ -47,18 +47,7 @@ def assess_by_rendering(
         for first in range(0, len(able), portion):
             places = able[first : first + portion]
             with torch.no_grad():
-                coverage = render(
-                    scene,
-                    settings.probe,
-                    poses[places],
-                    height=settings.height,
-                    width=settings.width,
-                    outputs=("coverage",),
-                    backend=backend,
-                    limits=limits,
-                    beam=settings.beam,
-                    contact=settings.contact,
-                )["coverage"]
+                coverage = recorded_coverage(scene, settings, poses[places], backend=backend, limits=limits)
             shares = supported_shares(coverage).tolist()
             for place, one in zip(places, assessor.with_support([found[i] for i in places], shares), strict=True):
                 found[place] = one

@@ -246,7 +246,7 @@ def _spread(
     if within_mm == 0.0 or decided.all() or not voted.any():
         return labels
     means_mm = 10.0 * scene.means.detach().cpu().float().numpy()
-    echo = _echo(scene)
+    echo = undirected_echo(scene)
     sources, sought = np.flatnonzero(decided), np.flatnonzero(~decided)
     exact = {"algorithm": 4, "leaf_max_size": 16}  # one k-d tree: its answers are exact, and the same each time
     index = cv2.flann.Index(means_mm[sources], exact)  # type: ignore[arg-type]
@@ -265,7 +265,7 @@ def _spread(
     return spread
 
 
-def _echo(scene: GaussianScene) -> npt.NDArray[np.float32]:  # [N] in [0, 1]
+def undirected_echo(scene: GaussianScene) -> npt.NDArray[np.float32]:  # [N] in [0, 1]
     """Intensities seen from no direction."""
     value = _SH_C0 * scene.sh0.detach().cpu().float().flatten()
     activated = torch.sigmoid(4.0 * value) if scene.info.intensity == "sigmoid" else (value + 1.0).clamp(0.5, 0.999)

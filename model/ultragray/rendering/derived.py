@@ -162,6 +162,21 @@ def label_parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
     return parts
 
 
+def recorded_part(scene: GaussianScene) -> GaussianScene | None:
+    """The Gaussians of a scene that stand for what was recorded; None where there are none."""
+    labels = scene.labels
+    if not scene.info.made_labels or labels is None:
+        return scene
+
+    def chosen() -> GaussianScene | None:
+        kept = ~torch.isin(labels, labels.new_tensor(scene.info.made_labels))
+        splats: dict[str, Any] = {name: raw.detach()[kept] for name, raw in scene.splats.items()}
+        info = replace(scene.info, gaussian_count=int(kept.sum()), label_names={})
+        return replace(scene, **splats, labels=None, info=info) if kept.any() else None
+
+    return scene.prepared("recorded", chosen)
+
+
 # The expected standard deviation of a pixel's error, from the planes rendered around it and the distances of views.
 #
 # All terms are computed in CELLS² cells of the image, over which B̄, γ and T are means, and then interpolated. i and
@@ -180,15 +195,21 @@ BEYOND_MM = 5.0
 
 def deviations(drawing: Drawing, names: Sequence[str]) -> Tensor:  # [C, H, W]
     """The output `uncertainty` of a scene that has its model, from the planes bmode, coverage and transmittance."""
-    scene, planes = drawing.scene, tuple(drawing.plane(name) for name in names)
+    scene = drawing.scene
+    planes = {name: drawing.plane(name) for name in names}
+    if (recorded := recorded_part(scene)) is not scene:
+        shown = planes["coverage"]
+        planes["coverage"] = torch.zeros_like(shown) if recorded is None else drawing.plane_of(recorded, "coverage")
     model = read_model(scene.info.confidence, len(scene.training_poses))
     assert model is not None
     assert model.uncertainty is not None
     views = TrainingViews(scene.at_rest().training_poses, scene.info.probe_or(None))
-    terms = variance_terms(planes, view_distances(views, drawing.poses_mm, drawing.probe), model.uncertainty.bands)
+    drawn = planes["bmode"], planes["coverage"], planes["transmittance"]
+    distances_mm = view_distances(views, drawing.poses_mm, drawing.probe)
+    terms = variance_terms(drawn, distances_mm, model.uncertainty.bands)
     weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
     deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()
-    return _interpolated(deviation, planes[0].shape[1:])
+    return _interpolated(deviation, drawing.shape[1:])
 
 
 def view_distances(

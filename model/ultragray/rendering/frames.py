@@ -26,7 +26,7 @@ from ultragray.rendering.backends.inputs import as_array, beam_cm, scene_poses
 from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.contact import Skin, Touch, at_rest
-from ultragray.rendering.derived import Drawing, View
+from ultragray.rendering.derived import Drawing, View, recorded_part
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
@@ -234,7 +234,9 @@ def render_shown(
     where it masks them. `in_bytes`: B-mode alone may come rounded to uint8. Raises what `render` raises.
     """
     names = settings.outputs if outputs is None else tuple(outputs)
-    if in_bytes and names == ("bmode",) and _is_plain(settings) and not (support is not None and support.masks):
+    is_recorded = not scene.info.made_labels
+    is_plain = is_recorded and _is_plain(settings) and not (support is not None and support.masks)
+    if in_bytes and names == ("bmode",) and is_plain:
         draw = BACKENDS[choose_backend(backend, scene)].draw_grey
         if draw is not None:
             beam = beam_cm(scene.info.beam if settings.beam is None else settings.beam, settings.probe)
@@ -258,7 +260,10 @@ def render_shown(
         ghost=settings.ghost,
         speckle=settings.speckle,
     )
-    blackened = None if support is None else support.look(frames["coverage"], frames.touch)
+    blackened = None
+    if support is not None:
+        coverage = frames["coverage"] if is_recorded else recorded_coverage(scene, settings, poses, backend=backend)
+        blackened = support.look(coverage, frames.touch)
     rendered = {name: frames[name] for name in names}
     if settings.display == AS_RENDERED and blackened is None:
         return rendered
@@ -271,6 +276,33 @@ def render_shown(
         frame = {name: pixels[one] for name, pixels in rendered.items()}
         shown.append(show(frame, settings.probe, settings.display.of_frame(pose), mask))
     return {name: torch.cat([frame[name] for frame in shown]) for name in rendered}
+
+
+def recorded_coverage(
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    *,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+) -> Tensor:  # [C, H, W]
+    """The coverage of frames by Gaussians that stand for what was recorded: what has been put in supports nothing."""
+    recorded = recorded_part(scene)
+    if recorded is None:
+        return scene.means.new_zeros((len(poses), settings.height, settings.width))
+    frames = render(
+        recorded,
+        settings.probe,
+        poses,
+        height=settings.height,
+        width=settings.width,
+        outputs=("coverage",),
+        backend=backend,
+        limits=limits,
+        beam=settings.beam,
+        contact=settings.contact,
+    )
+    return frames["coverage"]
 
 
 def _is_plain(settings: Resolved) -> bool:

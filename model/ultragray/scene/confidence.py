@@ -90,6 +90,21 @@ class TrainingViews:
         """Root of the mean square distance of the points of each image to each view."""
         return self._measured(poses, probe, POINTS_PER_SIDE)[2]
 
+    def interpolation_mm(self, points: FloatArray) -> FloatArray:  # [K, 3] mm -> [K]
+        """As `ViewMeasures` has it, of any points of the scene's frame."""
+        distances = np.empty((3, len(points)), np.float32)
+        _cpu.measure_views(
+            points=np.ascontiguousarray(points, np.float32),
+            **self._images,
+            angles=np.zeros(len(self._rotations), np.float32),
+            facing=np.ones(len(self._rotations), np.float32),
+            measures=distances.reshape(-1),
+            nearest=np.empty(len(points), np.int64),
+            around=np.empty(len(self._rotations), np.float32),
+        )
+        _, before, behind = distances.astype(np.float64)
+        return np.minimum(before * behind / np.maximum(before + behind, 1e-9), FAR_MM)
+
     def _measured(
         self, poses: FloatArray, probe: Probe, points_per_side: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:  # [3, C, K] mm, [C, K] degrees, [C, P] mm

@@ -78,12 +78,24 @@ class SceneInfo(Contract):
         high=1.0,
     )
 
+    provenance: dict[str, Any] = described(
+        "What an edit made it of: `parents`, SHA-256 by name; `edits`; `made`, labels of what was never recorded. "
+        "Empty: it was trained.",
+        factory=dict,
+    )
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "label_names", _label_names(self.label_names))
         super().__post_init__()
         for name, value in self.metrics.items():
             with under(f"metrics.{name}"):
                 checked_number(value, float)
+
+    @property
+    def made_labels(self) -> tuple[int, ...]:
+        """Labels of Gaussians that stand for nothing that was recorded."""
+        made = self.provenance.get("made", ())
+        return tuple(label for label in self.label_names if label in made)
 
     def probe_or(self, asked: Probe | None) -> Probe:
         """The probe asked for, else the one the scene was trained with.
@@ -128,7 +140,7 @@ def _label_names(names: Any) -> dict[int, str]:
 
 def info_to_json(info: SceneInfo) -> str:
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
-    for name in ("label_names", "beam", "speckle", "tissue_shares"):
+    for name in ("label_names", "beam", "speckle", "tissue_shares", "provenance"):
         if not document[name]:
             del document[name]  # a scene without them keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)

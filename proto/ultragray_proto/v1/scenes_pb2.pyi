@@ -65,7 +65,7 @@ class GetSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam", "speckle")
+    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam", "speckle", "parents", "edits", "made_labels")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -80,6 +80,13 @@ class Scene(_message.Message):
         key: int
         value: str
         def __init__(self, key: _Optional[int] = ..., value: _Optional[str] = ...) -> None: ...
+    class ParentsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     BOUNDS_MIN_MM_FIELD_NUMBER: _ClassVar[int]
     BOUNDS_MAX_MM_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
@@ -103,6 +110,9 @@ class Scene(_message.Message):
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
     BEAM_FIELD_NUMBER: _ClassVar[int]
     SPECKLE_FIELD_NUMBER: _ClassVar[int]
+    PARENTS_FIELD_NUMBER: _ClassVar[int]
+    EDITS_FIELD_NUMBER: _ClassVar[int]
+    MADE_LABELS_FIELD_NUMBER: _ClassVar[int]
     bounds_min_mm: _geometry_pb2.Position
     bounds_max_mm: _geometry_pb2.Position
     name: str
@@ -126,7 +136,10 @@ class Scene(_message.Message):
     private: bool
     beam: _geometry_pb2.ElevationBeam
     speckle: bool
-    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ..., speckle: _Optional[bool] = ...) -> None: ...
+    parents: _containers.ScalarMap[str, str]
+    edits: _containers.RepeatedScalarFieldContainer[str]
+    made_labels: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ..., speckle: _Optional[bool] = ..., parents: _Optional[_Mapping[str, str]] = ..., edits: _Optional[_Iterable[str]] = ..., made_labels: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class ConfidenceFit(_message.Message):
     __slots__ = ("error", "fitted_on")
@@ -210,6 +223,210 @@ class LabelSceneRequest(_message.Message):
     label_names: _containers.ScalarMap[int, str]
     within_mm: float
     def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[PaintedFrame, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., label_map: _Optional[bytes] = ..., registration: _Optional[str] = ..., into: _Optional[str] = ..., replace: _Optional[bool] = ..., private: _Optional[bool] = ..., label_names: _Optional[_Mapping[int, str]] = ..., within_mm: _Optional[float] = ...) -> None: ...
+
+class EditSceneRequest(_message.Message):
+    __slots__ = ("scene", "into", "edits", "private")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    INTO_FIELD_NUMBER: _ClassVar[int]
+    EDITS_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    into: str
+    edits: _containers.RepeatedCompositeFieldContainer[Edit]
+    private: bool
+    def __init__(self, scene: _Optional[str] = ..., into: _Optional[str] = ..., edits: _Optional[_Iterable[_Union[Edit, _Mapping]]] = ..., private: _Optional[bool] = ...) -> None: ...
+
+class Edit(_message.Message):
+    __slots__ = ("move", "cut", "merge", "insert", "lesions", "relabel", "thin")
+    MOVE_FIELD_NUMBER: _ClassVar[int]
+    CUT_FIELD_NUMBER: _ClassVar[int]
+    MERGE_FIELD_NUMBER: _ClassVar[int]
+    INSERT_FIELD_NUMBER: _ClassVar[int]
+    LESIONS_FIELD_NUMBER: _ClassVar[int]
+    RELABEL_FIELD_NUMBER: _ClassVar[int]
+    THIN_FIELD_NUMBER: _ClassVar[int]
+    move: MoveEdit
+    cut: CutEdit
+    merge: MergeEdit
+    insert: InsertEdit
+    lesions: LesionsEdit
+    relabel: RelabelEdit
+    thin: ThinEdit
+    def __init__(self, move: _Optional[_Union[MoveEdit, _Mapping]] = ..., cut: _Optional[_Union[CutEdit, _Mapping]] = ..., merge: _Optional[_Union[MergeEdit, _Mapping]] = ..., insert: _Optional[_Union[InsertEdit, _Mapping]] = ..., lesions: _Optional[_Union[LesionsEdit, _Mapping]] = ..., relabel: _Optional[_Union[RelabelEdit, _Mapping]] = ..., thin: _Optional[_Union[ThinEdit, _Mapping]] = ...) -> None: ...
+
+class MoveEdit(_message.Message):
+    __slots__ = ("shift_mm", "turn_deg", "about_mm", "shape")
+    SHIFT_MM_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_FIELD_NUMBER: _ClassVar[int]
+    ABOUT_MM_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    shift_mm: _containers.RepeatedScalarFieldContainer[float]
+    turn_deg: _containers.RepeatedScalarFieldContainer[float]
+    about_mm: _containers.RepeatedScalarFieldContainer[float]
+    shape: Shape
+    def __init__(self, shift_mm: _Optional[_Iterable[float]] = ..., turn_deg: _Optional[_Iterable[float]] = ..., about_mm: _Optional[_Iterable[float]] = ..., shape: _Optional[_Union[Shape, _Mapping]] = ...) -> None: ...
+
+class CutEdit(_message.Message):
+    __slots__ = ("shape", "keep")
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    KEEP_FIELD_NUMBER: _ClassVar[int]
+    shape: Shape
+    keep: str
+    def __init__(self, shape: _Optional[_Union[Shape, _Mapping]] = ..., keep: _Optional[str] = ...) -> None: ...
+
+class MergeEdit(_message.Message):
+    __slots__ = ("shift_mm", "turn_deg", "about_mm", "scene", "register", "match_gain", "seam_mm", "fit_steps")
+    SHIFT_MM_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_FIELD_NUMBER: _ClassVar[int]
+    ABOUT_MM_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    REGISTER_FIELD_NUMBER: _ClassVar[int]
+    MATCH_GAIN_FIELD_NUMBER: _ClassVar[int]
+    SEAM_MM_FIELD_NUMBER: _ClassVar[int]
+    FIT_STEPS_FIELD_NUMBER: _ClassVar[int]
+    shift_mm: _containers.RepeatedScalarFieldContainer[float]
+    turn_deg: _containers.RepeatedScalarFieldContainer[float]
+    about_mm: _containers.RepeatedScalarFieldContainer[float]
+    scene: str
+    register: bool
+    match_gain: bool
+    seam_mm: float
+    fit_steps: int
+    def __init__(self, shift_mm: _Optional[_Iterable[float]] = ..., turn_deg: _Optional[_Iterable[float]] = ..., about_mm: _Optional[_Iterable[float]] = ..., scene: _Optional[str] = ..., register: _Optional[bool] = ..., match_gain: _Optional[bool] = ..., seam_mm: _Optional[float] = ..., fit_steps: _Optional[int] = ...) -> None: ...
+
+class InsertEdit(_message.Message):
+    __slots__ = ("frequency_mhz", "dynamic_range_db", "shape", "tissue", "label", "echo_db", "attenuation", "texture_from_mm", "wall_mm", "seed")
+    FREQUENCY_MHZ_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    TISSUE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    ECHO_DB_FIELD_NUMBER: _ClassVar[int]
+    ATTENUATION_FIELD_NUMBER: _ClassVar[int]
+    TEXTURE_FROM_MM_FIELD_NUMBER: _ClassVar[int]
+    WALL_MM_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    frequency_mhz: float
+    dynamic_range_db: float
+    shape: Shape
+    tissue: str
+    label: str
+    echo_db: float
+    attenuation: float
+    texture_from_mm: _containers.RepeatedScalarFieldContainer[float]
+    wall_mm: float
+    seed: int
+    def __init__(self, frequency_mhz: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., shape: _Optional[_Union[Shape, _Mapping]] = ..., tissue: _Optional[str] = ..., label: _Optional[str] = ..., echo_db: _Optional[float] = ..., attenuation: _Optional[float] = ..., texture_from_mm: _Optional[_Iterable[float]] = ..., wall_mm: _Optional[float] = ..., seed: _Optional[int] = ...) -> None: ...
+
+class LesionsEdit(_message.Message):
+    __slots__ = ("frequency_mhz", "dynamic_range_db", "count", "tissues", "radius_min_mm", "radius_max_mm", "seed")
+    FREQUENCY_MHZ_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    TISSUES_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_MIN_MM_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_MAX_MM_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    frequency_mhz: float
+    dynamic_range_db: float
+    count: int
+    tissues: _containers.RepeatedScalarFieldContainer[str]
+    radius_min_mm: float
+    radius_max_mm: float
+    seed: int
+    def __init__(self, frequency_mhz: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., count: _Optional[int] = ..., tissues: _Optional[_Iterable[str]] = ..., radius_min_mm: _Optional[float] = ..., radius_max_mm: _Optional[float] = ..., seed: _Optional[int] = ...) -> None: ...
+
+class RelabelEdit(_message.Message):
+    __slots__ = ("shapes", "label")
+    SHAPES_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    shapes: _containers.RepeatedCompositeFieldContainer[Shape]
+    label: str
+    def __init__(self, shapes: _Optional[_Iterable[_Union[Shape, _Mapping]]] = ..., label: _Optional[str] = ...) -> None: ...
+
+class ThinEdit(_message.Message):
+    __slots__ = ("gaussian_count", "file_bytes")
+    GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
+    FILE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    gaussian_count: int
+    file_bytes: int
+    def __init__(self, gaussian_count: _Optional[int] = ..., file_bytes: _Optional[int] = ...) -> None: ...
+
+class Shape(_message.Message):
+    __slots__ = ("sphere", "ellipsoid", "box", "tube", "mesh", "map", "label")
+    SPHERE_FIELD_NUMBER: _ClassVar[int]
+    ELLIPSOID_FIELD_NUMBER: _ClassVar[int]
+    BOX_FIELD_NUMBER: _ClassVar[int]
+    TUBE_FIELD_NUMBER: _ClassVar[int]
+    MESH_FIELD_NUMBER: _ClassVar[int]
+    MAP_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    sphere: SphereShape
+    ellipsoid: EllipsoidShape
+    box: BoxShape
+    tube: TubeShape
+    mesh: MeshShape
+    map: MapShape
+    label: LabelShape
+    def __init__(self, sphere: _Optional[_Union[SphereShape, _Mapping]] = ..., ellipsoid: _Optional[_Union[EllipsoidShape, _Mapping]] = ..., box: _Optional[_Union[BoxShape, _Mapping]] = ..., tube: _Optional[_Union[TubeShape, _Mapping]] = ..., mesh: _Optional[_Union[MeshShape, _Mapping]] = ..., map: _Optional[_Union[MapShape, _Mapping]] = ..., label: _Optional[_Union[LabelShape, _Mapping]] = ...) -> None: ...
+
+class SphereShape(_message.Message):
+    __slots__ = ("centre_mm", "radius_mm")
+    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_MM_FIELD_NUMBER: _ClassVar[int]
+    centre_mm: _containers.RepeatedScalarFieldContainer[float]
+    radius_mm: float
+    def __init__(self, centre_mm: _Optional[_Iterable[float]] = ..., radius_mm: _Optional[float] = ...) -> None: ...
+
+class EllipsoidShape(_message.Message):
+    __slots__ = ("centre_mm", "radii_mm", "turn_deg")
+    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
+    RADII_MM_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_FIELD_NUMBER: _ClassVar[int]
+    centre_mm: _containers.RepeatedScalarFieldContainer[float]
+    radii_mm: _containers.RepeatedScalarFieldContainer[float]
+    turn_deg: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, centre_mm: _Optional[_Iterable[float]] = ..., radii_mm: _Optional[_Iterable[float]] = ..., turn_deg: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class BoxShape(_message.Message):
+    __slots__ = ("min_mm", "max_mm")
+    MIN_MM_FIELD_NUMBER: _ClassVar[int]
+    MAX_MM_FIELD_NUMBER: _ClassVar[int]
+    min_mm: _containers.RepeatedScalarFieldContainer[float]
+    max_mm: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, min_mm: _Optional[_Iterable[float]] = ..., max_mm: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class MeshShape(_message.Message):
+    __slots__ = ("data", "format")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    data: str
+    format: str
+    def __init__(self, data: _Optional[str] = ..., format: _Optional[str] = ...) -> None: ...
+
+class MapShape(_message.Message):
+    __slots__ = ("data", "format", "label")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    data: str
+    format: str
+    label: int
+    def __init__(self, data: _Optional[str] = ..., format: _Optional[str] = ..., label: _Optional[int] = ...) -> None: ...
+
+class LabelShape(_message.Message):
+    __slots__ = ("name",)
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    def __init__(self, name: _Optional[str] = ...) -> None: ...
+
+class TubeShape(_message.Message):
+    __slots__ = ("points_mm", "radius_mm")
+    POINTS_MM_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_MM_FIELD_NUMBER: _ClassVar[int]
+    points_mm: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Position]
+    radius_mm: float
+    def __init__(self, points_mm: _Optional[_Iterable[_Union[_geometry_pb2.Position, _Mapping]]] = ..., radius_mm: _Optional[float] = ...) -> None: ...
 
 class PaintedFrame(_message.Message):
     __slots__ = ("pose", "labels")

@@ -59,6 +59,11 @@ class SceneServiceStub:
                 request_serializer=ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
                 _registered_method=True)
+        self.EditScene = channel.unary_unary(
+                '/ultragray.v1.SceneService/EditScene',
+                request_serializer=ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
+                _registered_method=True)
 
 
 class SceneServiceServicer:
@@ -101,6 +106,14 @@ class SceneServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def EditScene(self, request, context):
+        """Moves, cuts, merges, relabels or thins a scene, or inserts bodies, as a new scene; the scene stays as it is.
+        SCENE_NOT_FOUND, SCENE_EXISTS, INVALID_ARGUMENT.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_SceneServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -127,6 +140,11 @@ def add_SceneServiceServicer_to_server(servicer, server):
             'LabelScene': grpc.unary_unary_rpc_method_handler(
                     servicer.LabelScene,
                     request_deserializer=ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_scenes__pb2.Scene.SerializeToString,
+            ),
+            'EditScene': grpc.unary_unary_rpc_method_handler(
+                    servicer.EditScene,
+                    request_deserializer=ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_scenes__pb2.Scene.SerializeToString,
             ),
     }
@@ -264,6 +282,33 @@ class SceneService:
             target,
             '/ultragray.v1.SceneService/LabelScene',
             ultragray_dot_v1_dot_scenes__pb2.LabelSceneRequest.SerializeToString,
+            ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def EditScene(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.SceneService/EditScene',
+            ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.SerializeToString,
             ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
             options,
             channel_credentials,

@@ -50,6 +50,7 @@ _COMMANDS = {  # by the panels of the help
         "plan": (".plan:plan", "Find where to look next: views that would teach a scene most."),
         "calibrate": (".register:calibrate_app", "Register a robot or tracker to a scene."),
         "label": (".labels:label", "Label the Gaussians of a scene by a NIfTI map or by painted frames."),
+        "edit": (".editing:edit", "Move, cut, merge, relabel or thin a scene, or insert lesions, as a new one."),
         "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
         "slicer": (".scenes:slicer", "Write a scene file of 3D Slicer that shows a served scene live."),
         "import": (".scenes:import_scene", "Turn a PLY file or a released checkpoint into a scene file."),

@@ -8,15 +8,15 @@ from typing import Annotated
 import numpy as np
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.label_maps import (
+from ultragray.geometry.registration import load_registration
+from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
+from ultragray.scene.label_maps import (
     LABEL_MAP_SUFFIXES,
     PAINTED_SUFFIX,
     parse_names,
     read_label_map,
     read_painted,
 )
-from ultragray.geometry.registration import load_registration
-from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray_service.cli.terminal import (
     SCENE_SUFFIX,
     Force,

@@ -18,7 +18,6 @@ import numpy as np
 from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions, find_source
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.exchange.label_maps import parse_names, read_label_map, read_painted
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
 from ultragray.geometry.pose import check_poses
@@ -27,7 +26,20 @@ from ultragray.rendering.pixels import png_file
 from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
 from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
+from ultragray.scene.label_maps import parse_names, read_label_map, read_painted
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
+from ultragray_service.cli.editing import (
+    AtOption,
+    CutOption,
+    EditsOption,
+    InsertOption,
+    LesionsOption,
+    MergeOption,
+    RadiusOption,
+    SeedOption,
+    ThinOption,
+    edits_asked,
+)
 from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
@@ -257,6 +269,37 @@ def label_scene(
         ]
     scene = connection.json("POST", route("scenes", name, suffix=suffix), asked)
     tell(f"labelled {name} as {into}: {', '.join(scene['label_names'].values())}", scene, as_json=json)
+
+
+@scenes_app.command(
+    "edit",
+    epilog=examples(
+        "ultragray scenes edit liver --into liver-cyst --insert cyst --at-mm 0,0,30",
+        "ultragray scenes edit left --into whole --merge right",
+    ),
+)
+@with_connection
+def edit_scene(
+    connection: Connection,
+    name: NameArgument,
+    into: Annotated[str, option("Name of the scene to make.", shown=False)],
+    edits: EditsOption = None,
+    cut_box_mm: CutOption = None,
+    merge: MergeOption = None,
+    insert: InsertOption = None,
+    at_mm: AtOption = None,
+    radius_mm: RadiusOption = 5.0,
+    lesions: LesionsOption = None,
+    seed: SeedOption = 0,
+    gaussians: ThinOption = None,
+    private: Annotated[bool, option("Others do not see the scene that is made.", "--private")] = False,
+    json: Json = False,
+) -> None:
+    """Have the service edit a scene, as another one that names its parents. Merged scenes are the service's, too."""
+    asked = edits_asked(edits, cut_box_mm, merge, insert, at_mm, radius_mm, lesions, seed, gaussians)
+    body = {"into": into, "private": private, "edits": to_dict(asked, with_none=False)}
+    scene = connection.json("POST", route("scenes", name, suffix=":edit"), body)
+    tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, of {', '.join(scene['parents'])}", scene, as_json=json)
 
 
 def _base64(data: bytes) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import json
 import re
 from bisect import bisect_right
 from collections.abc import Awaitable, Callable, Iterator, Sequence
@@ -307,6 +308,9 @@ class Scene:
     speckle: bool = described("Whether its frames can have natural speckle.")
     owner: str | None = described("Who imported or trained it; null: nobody.")
     private: bool = described("Whether others may not see it.")
+    parents: dict[str, str] = described("SHA-256 by name of the scenes that edits made it of; empty: it was trained.")
+    edits: list[str] = described("What was done to them, each in JSON.")
+    made_labels: list[str] = described("Names of the labels of what was put in, and never recorded.")
 
     @property
     def bounds_min_mm(self) -> Position:
@@ -343,6 +347,9 @@ class Scene:
             speckle=info.speckle is not None,
             owner=ownership.owner,
             private=ownership.private,
+            parents=info.provenance.get("parents", {}),
+            edits=[json.dumps(edit) for edit in info.provenance.get("edits", ())],
+            made_labels=[info.label_names[label] for label in info.made_labels],
         )
 
 

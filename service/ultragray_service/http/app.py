@@ -37,6 +37,7 @@ from ultragray_service.http import problems
 from ultragray_service.http.bodies import (
     SPECIFICATIONS,
     AssessBody,
+    EditBody,
     JobBody,
     LabelBody,
     LabelMapBody,
@@ -231,6 +232,7 @@ _READ: tuple[Any, ...] = (
     LocalizeBody,
     PlanBody,
     LabelBody,
+    EditBody,
     LabelMapBody,
     RegistrationBody,
     StreamMessage,

@@ -29,7 +29,9 @@ from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
+from ultragray.scene.edits import Edit
 from ultragray_service.core.clocks import ClockStamps
+from ultragray_service.core.editing import EditTarget
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
@@ -279,6 +281,14 @@ class LabelMapBody(LabelTarget):
 
 
 LABEL_MAP = Apart("label_map", str)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditBody(EditTarget):
+    """Edits, and the scene to make by them. Files of shapes are base64 in `data`."""
+
+
+EDITS = Apart("edits", list, Edit, max_characters=2**26, max_bytes=2**27)
 
 
 @dataclass(frozen=True, kw_only=True)

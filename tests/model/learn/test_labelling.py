@@ -9,12 +9,12 @@ import torch
 
 from ultragray import GaussianScene, render
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.label_maps import read_label_map, read_painted
 from ultragray.learn.labelling import UNPAINTED, PaintedFrame, label_by_frames, label_by_map, same_but_for_labels
 from ultragray.phantom.demo import DEMO_PROBE, LABEL_NAMES, demo_poses, labels_of, load_demo_scene
 from ultragray.phantom.imaging import tissues
 from ultragray.rendering.volume_fields import write_volume
 from ultragray.rendering.volumes import VolumeGrid
+from ultragray.scene.label_maps import read_label_map, read_painted
 
 SIDE = 256
 BONE, MUSCLE = 1, 2

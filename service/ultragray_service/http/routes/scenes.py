@@ -35,10 +35,12 @@ from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import arrivals
 from ultragray_service.http.accept import PNG, RAW
 from ultragray_service.http.bodies import (
+    EDITS,
     LABEL_MAP,
     LARGE_IMAGE,
     PAINTED_FRAMES,
     AssessBody,
+    EditBody,
     LabelBody,
     LabelMapBody,
     LocalizeBody,
@@ -177,6 +179,14 @@ async def label_scene_by_map(request: Request, service: ServiceDep, scene: Scene
     body = await read_json_body(request, LabelMapBody, LABEL_MAP)
     nifti = await asyncio.to_thread(_bytes_of, body.label_map, "label_map")
     work = service.labels.by_map(scene, body, nifti, body.registration)
+    return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
+
+
+@router.post("/{scene}:edit", status_code=201, openapi_extra=body_schema(EditBody), responses=_LABELLED)
+async def edit_scene(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+    """Moves, cuts, merges, relabels or thins a scene, or inserts bodies, as a new scene; the scene stays as it is."""
+    body = await read_json_body(request, EditBody, EDITS)
+    work = service.edits.edit(scene, body)
     return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
 
 

@@ -1,0 +1,1 @@
+"""Edits of scenes (`ultragray.scene.edits`), carried out: each gives a new scene."""

@@ -1,0 +1,99 @@
+"""Scenes that are edited through each door: new ones, which name their parents."""
+
+import base64
+import json
+
+import httpx
+import pytest
+from typer.testing import CliRunner
+
+from ultragray import GaussianScene
+from ultragray_client import Client, InsertEdit, LabelShape, MergeEdit, TubeShape, errors
+from ultragray_service.cli.app import app
+
+KEY = "0123456789abcdef-edits"
+CYST = {"kind": "insert", "tissue": "cyst", "shape": {"kind": "sphere", "centre_mm": [0, 0, 12], "radius_mm": 3}}
+CUT = {"kind": "cut", "shape": {"kind": "box", "min_mm": [-30, -30, -5], "max_mm": [0, 30, 40]}}
+
+
+@pytest.fixture(scope="module")
+def service(start_service, artifacts):
+    return start_service(artifact_folder=artifacts, api_keys=KEY)
+
+
+@pytest.fixture
+def http(service):
+    with httpx.Client(base_url=service.http, timeout=300, headers={"Authorization": f"Bearer {KEY}"}) as client:
+        yield client
+
+
+def test_an_edit_makes_a_scene_that_names_its_parent_and_what_was_put_in(http):
+    before = http.get("/v1/scenes/demo").json()
+    answer = http.post("/v1/scenes/demo:edit", json={"into": "with-cyst", "edits": [CUT, CYST]})
+    assert answer.status_code == 201, answer.text
+    made = answer.json()
+    assert (list(made["parents"]), made["made_labels"]) == (["demo"], ["cyst"])
+    assert [json.loads(edit)["kind"] for edit in made["edits"]] == ["cut", "insert"]
+    assert "labels" in made["outputs"]
+    after = http.get("/v1/scenes/demo").json()
+    assert {**after, "loaded": None, "loaded_processes": None} == {**before, "loaded": None, "loaded_processes": None}
+    again = http.post("/v1/scenes/demo:edit", json={"into": "with-cyst", "edits": [CYST]})
+    assert again.json()["reason"] == "SCENE_EXISTS"
+
+
+def test_grpc_takes_every_kind_of_shape_and_merges_scenes_of_the_service(service, http):
+    assert http.post("/v1/scenes/demo:edit", json={"into": "left", "edits": [CUT]}).status_code == 201
+    right = {"into": "right", "edits": [{**CUT, "keep": "outside"}]}
+    assert http.post("/v1/scenes/demo:edit", json=right).status_code == 201
+    tube = TubeShape(points_mm=((0.0, -9.0, 12.0), (0.0, 9.0, 12.0)), radius_mm=2.0)
+    with Client(service.grpc, api_key=KEY) as client:
+        edits = [MergeEdit(scene="right", match_gain=False), InsertEdit(shape=tube, tissue="blood", label="vessel")]
+        whole = client.scenes.edit("left", edits, into="whole")
+        assert set(whole.parents) == {"left", "right"}
+        assert whole.made_labels == ("vessel",)
+        assert whole.gaussian_count > client.scenes.get("demo").gaussian_count
+        with pytest.raises(errors.SceneNotFound):
+            client.scenes.edit("left", [MergeEdit(scene="nowhere")], into="none")
+        with pytest.raises(errors.InvalidArgument) as told:
+            client.scenes.edit("left", [InsertEdit(shape=LabelShape(name="x"))], into="none")
+    assert told.value.field == "edits[0].insert.shape" or "shape" in told.value.field
+
+
+@pytest.mark.parametrize(
+    ("edits", "field"),
+    [
+        ([], "edits"),
+        ([{"kind": "melt"}], "edits[0]"),
+        ([{**CYST, "shape": {"kind": "sphere", "centre_mm": [0, 0, 12], "radius_mm": 0}}], "edits[0].shape.radius_mm"),
+        ([{**CUT, "shape": {"kind": "mesh", "data": base64.b64encode(b"no mesh").decode()}}], "edits[0].data"),
+        ([{**CUT, "shape": {"kind": "sphere", "centre_mm": [900, 0, 0], "radius_mm": 1}}], "edits"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_and_leaves_nothing(http, edits, field):
+    answer = http.post("/v1/scenes/demo:edit", json={"into": "none", "edits": edits})
+    assert answer.status_code == 422, answer.text
+    assert answer.json()["field"].startswith(field), answer.text
+    assert http.get("/v1/scenes/none").status_code == 404
+
+
+def test_the_command_line_edits_files_and_scenes_of_a_service(service, demo_scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demo_scene.save("demo.ugr")
+    (tmp_path / "edits.toml").write_text(
+        '[[edits]]\nkind = "relabel"\nlabel = "spot"\n'
+        'shapes = [{kind = "sphere", centre_mm = [0, 0, 12], radius_mm = 4}]\n'
+    )
+    runner = CliRunner()
+    short = ["--insert", "tumour", "--at-mm", "0,0,12", "--radius-mm", "3"]
+    found = runner.invoke(app, ["edit", "demo.ugr", "-o", "new.ugr", "--edits", "edits.toml", *short, "--json"])
+    assert found.exit_code == 0, found.output
+    made = GaussianScene.load("new.ugr")
+    assert set(made.info.label_names.values()) >= {"spot", "tumour"}
+    assert list(made.info.provenance["parents"]) == ["demo"]
+    shown = runner.invoke(app, ["show", "new.ugr", "--json"])
+    assert [edit["kind"] for edit in json.loads(shown.output)["provenance"]["edits"]] == ["relabel", "insert"]
+    address = ["--address", service.http, "--api-key", KEY]
+    there = runner.invoke(app, ["scenes", "edit", "demo", "--into", "by-command", *short, *address, "--json"])
+    assert there.exit_code == 0, there.output
+    assert json.loads(there.output)["made_labels"] == ["tumour"]
+    assert runner.invoke(app, ["edit", "demo.ugr", "-o", "none.ugr"]).exit_code == 2
