@@ -39,6 +39,7 @@ from ultragray.exchange import ros_messages as ros
 from ultragray.exchange.rendering import render_to_file
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import LinearProbe
+from ultragray.learn.editing.editor import edit_scene
 from ultragray.learn.evaluation.baselines import compound
 from ultragray.learn.registration import register_frames
 from ultragray.learn.training.agreement import agreed_path
@@ -53,6 +54,8 @@ from ultragray.rendering.volume_fields import sample_slice
 from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray.samplers import AroundSampler
 from ultragray.scene.confidence import Assessor, supported
+from ultragray.scene.edits import InsertEdit
+from ultragray.scene.shapes import SphereShape, TubeShape
 from ultragray_studies.gym import StandardPlaneEnv
 from ultragray_studies.hand import Errors, HandSweep
 
@@ -66,6 +69,7 @@ OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between t
 MOST_AGENT_STEPS = 1000
 _TO_PAPER = np.array([[1.0, 0.55, 0.0], [0.0, -0.4, 1.0]])  # cabinet projection: x to the right, z down, y away
 LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0", "tool": "#ffffff"}
+LABEL_COLOURS |= {"cyst": "#5bc8af", "calcification": "#f26419", "artery": "#e84855", "artery wall": "#ffd6d6"}
 
 
 def main() -> None:
@@ -77,6 +81,7 @@ def main() -> None:
     draw_contact(scene, IMAGES / "contact.png")
     draw_speckle(scene, IMAGES / "speckle.png")
     draw_tools(scene, IMAGES / "tools.png")
+    draw_editing(scene, IMAGES / "editing.png")
     draw_cases(scene, IMAGES / "cases.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
@@ -250,6 +255,27 @@ def draw_tools(scene: GaussianScene, path: Path) -> None:
         panels[number].imshow(frames["bmode"][0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
         panels[number].set_title(caption, fontsize=8)
         draw_labels(panels[number + len(shown)], frames["labels"][0].numpy(), names)
+    save(figure, path)
+
+
+def draw_editing(scene: GaussianScene, path: Path) -> None:
+    """What was recorded, and what edits put into it, with its labels."""
+    cyst = InsertEdit(shape=SphereShape(centre_mm=(-14.0, 0.0, 24.0), radius_mm=5.0), tissue="cyst")
+    stone = InsertEdit(shape=SphereShape(centre_mm=(15.0, 0.0, 20.0), radius_mm=1.5), tissue="calcification")
+    way = TubeShape(points_mm=((-26.0, -4.0, 20.0), (-14.0, 0.0, 24.0), (-2.0, 4.0, 20.0)), radius_mm=2.2)
+    vessel = InsertEdit(shape=way, tissue="blood", label="artery", wall_mm=0.6)
+    edited = {
+        "as recorded": scene,
+        "a cyst, a calcification": edit_scene(scene, [cyst, stone]),
+        "a vessel": edit_scene(scene, [vessel]),
+    }
+    figure, panels = panel_row(rows=2, columns=len(edited))
+    for place, (title, one) in enumerate(edited.items()):
+        frames = render(one, None, np.eye(4), height=SIDE, width=SIDE, outputs=("bmode", "labels", "coverage"))
+        panels[place].imshow(frames["bmode"][0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panels[place].set_title(title, fontsize=8)
+        labels = np.where(supported(frames["coverage"][0].numpy()), frames["labels"][0].numpy(), 0)
+        draw_labels(panels[place + len(edited)], labels, one.info.label_names)
     save(figure, path)
 
 
