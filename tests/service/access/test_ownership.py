@@ -73,6 +73,7 @@ BODIES = {
     "scene}:assess": {"poses": [POSE]},
     "scene}:label": {"into": "mine", "frames": [{"pose": POSE, "labels": ""}]},
     "scene}:label-by-map": {"into": "mine", "label_map": ""},
+    "scene}:edit": {"into": "mine", "edits": [{"kind": "thin", "gaussian_count": 1}]},
 }
 NAMING = [
     ("POST", "/v1/jobs", {"kind": "train", "specification": {"dataset": "{name}", "scene": "mine"}}),
@@ -176,7 +177,8 @@ def test_private_things_answer_at_every_method_as_if_they_were_not_there(keyed, 
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
     plane = {"origin_mm": geometry_pb2.Position(), "size_mm": rendering_pb2.SliceSize(width=1, height=1)}
     given = {"pose": pose, "start": pose, "poses": [pose], "slice": rendering_pb2.SliceSettings(**plane)}
-    given |= {"into": "mine", "frames": [scenes_pb2.PaintedFrame(pose=pose)]}
+    edit = scenes_pb2.Edit(thin=scenes_pb2.ThinEdit(gaussian_count=1))
+    given |= {"into": "mine", "frames": [scenes_pb2.PaintedFrame(pose=pose)], "edits": [edit]}
 
     def ask(channel, name, job):
         things = {**given, **dict.fromkeys([kind.value for kind in PRIVATE], name), "job": job}
@@ -379,6 +381,16 @@ def test_admins_pause_drain_and_resume_over_http(keyed, database):
             ("admin", f"worker.{wish}", "absent", "WORKER_NOT_FOUND"),
         }
         wait_until(lambda expected=expected: expected <= audited())
+
+
+def test_a_private_scene_is_not_merged_into_somebody_elses(keyed, scene_bytes):
+    for name, private in (("hidden-half", "?private=true"), ("open-half", "")):
+        answer = keyed.http("alice", "PUT", f"/v1/scenes/{name}{private}", content=scene_bytes)
+        assert answer.status_code == 201
+    body = {"into": "both-halves", "edits": [{"kind": "merge", "scene": "hidden-half", "fit_steps": 0}]}
+    refused = keyed.http("bob", "POST", "/v1/scenes/open-half:edit", json=body)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "SCENE_NOT_FOUND")
+    assert keyed.http("alice", "POST", "/v1/scenes/open-half:edit", json=body).status_code == 201
 
 
 def test_labels_are_put_into_a_scene_by_its_owner_alone(keyed, scene_bytes):
