@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed confidence speckle prediction preview environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing confidence speckle prediction preview environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -218,6 +218,12 @@ compressed: $(VENV)/installed-dev  ## what compressed scene files keep of frames
 	$(BIN)/python benchmarks/compressed.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show compressed
 	$(KEEP) compressed
+
+editing: $(VENV)/installed-dev  ## what edits of scenes do to frames: 500 random insertions and their seams, merging, thinning; trains first, half an hour
+	$(READY)
+	$(BIN)/python benchmarks/editing.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show editing
+	$(KEEP) editing
 
 confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, scene by scene; takes an hour
 	$(READY)

@@ -25,6 +25,7 @@ from pathlib import Path
 import ablations
 import compressed
 import confidence
+import editing
 import hand
 import localization
 import measuring
@@ -57,6 +58,7 @@ TARGETS = {
         )
     },
     "compressed": "compressed",
+    "editing": "editing",
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
@@ -375,6 +377,7 @@ BLOCKS = {
     "hand": Block("hand", hand.predicted, hand.of_paths),
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "compressed": Block("compressed", compressed.kept),
+    "editing": Block("editing", editing.told),
     "localization": Block("localization", localization.found_frames),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
     "speckle": Block("speckle", speckle.textures),

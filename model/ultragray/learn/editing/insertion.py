@@ -138,7 +138,7 @@ def _filled(
     found = []
     while len(cubes):
         away = distance(cubes)
-        near = np.abs(away) < 1.5 * side if side > 1.001 * smallest else np.zeros(len(cubes), bool)
+        near = np.abs(away) < 2.5 * side if side > 1.001 * smallest else np.zeros(len(cubes), bool)
         least = 0.0 if side > 1.001 * smallest else 0.5 * side
         kept = cubes[~near & (away < least)]
         found.append(np.column_stack([kept, np.full(len(kept), side / _SPACING)]))
