@@ -30,6 +30,7 @@ import hand
 import localization
 import measuring
 import methods_tables
+import planning
 import poses
 import prediction
 import preview
@@ -54,7 +55,7 @@ TARGETS = {
         name: name
         for name in (
             *("ablations", "poses", "hand", "localization", "confidence"),
-            *("speckle", "environment", "prediction", "preview", "ros"),
+            *("speckle", "environment", "prediction", "preview", "planning", "ros"),
         )
     },
     "compressed": "compressed",
@@ -368,6 +369,7 @@ BLOCKS = {
     "environment": Block("environment", environment),
     "foretold poses": Block("prediction", prediction.foretold_poses),
     "previewed frames": Block("preview", preview.previewed_frames),
+    "planned views": Block("planning", planning.planned_and_even),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),
     "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),

@@ -54,6 +54,8 @@ function operations(paths) {
   return Object.fromEntries(ruled.map(([name, told]) => [name, { role: told["x-role"], owned: told["x-owned"] }]));
 }
 
+/** What of a plan is asked for by a form, in its order. */
+const PLANNED = ["want", "within_mm", "views", "path_mm", "region_mm", "label", "box_mm", "tilt_deg", "rock_deg", "turn_deg"];
 const contract = (text) => `import type { Described } from "../described";\n\n${text}`;
 /** What every view needs is apart from what only some do, so that the page begins with less. */
 const texts = {
@@ -61,6 +63,7 @@ const texts = {
   "contract.ts": contract(`export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
 export const outputs: Described = ${JSON.stringify(described(schemas.Scene.properties.outputs), null, 1)};
 export const within: Described = ${JSON.stringify(described(only(schemas.LocalizeBody, ["within_mm", "within_deg"])), null, 1)};
+export const planSettings: Described = ${JSON.stringify(described(only(schemas.PlanBody, PLANNED)), null, 1)};
 export const namedProbes = ${JSON.stringify(schemas.Probe["x-named"], null, 1)};
 export const renderedAs: Described = ${JSON.stringify(described(schemas.RenderSpecification.properties.format), null, 1)};
 export const roles = ${JSON.stringify(schemas.Role.enum)} as const;

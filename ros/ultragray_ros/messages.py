@@ -14,12 +14,13 @@ from dataclasses import asdict
 import numpy as np
 import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, TransformStamped
+from geometry_msgs.msg import Quaternion as Orientation
 from PIL import Image as Picture
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
-from ultragray_client import Frame, Placement, Quaternion
+from ultragray_client import Frame, Placement, Quaternion, ViewPlan, quaternion_from_pose
 from ultragray_client.frames import origin_of
 from ultragray_client.recording.messages import geometry_document
 
@@ -46,6 +47,24 @@ def stamped_pose(transform: TransformStamped) -> PoseStamped:
     position.x, position.y, position.z = moved.x, moved.y, moved.z
     pose.pose.orientation = transform.transform.rotation
     return pose
+
+
+def planned_poses(plan: ViewPlan, header: Header) -> PoseArray:
+    """The views of a plan in the order to travel them; with a registration those of the flange in its base."""
+    poses = []
+    for view in plan.views:
+        matrix = view.pose if view.flange_to_base is None else view.flange_to_base
+        w, x, y, z = quaternion_from_pose(matrix)
+        place = dict(zip("xyz", (matrix[:3, 3] / MM_PER_M).tolist(), strict=True))
+        poses.append(Pose(position=Point(**place), orientation=Orientation(w=w, x=x, y=y, z=z)))
+    return PoseArray(header=header, poses=poses)
+
+
+def plan_report(plan: ViewPlan) -> String:
+    """What a plan is expected to gain, as JSON: the gains in the order of its poses, in all, and the way in metres."""
+    gains = [view.gain for view in plan.views]
+    document = {"gains": gains, "before": plan.before, "after": plan.after, "path_m": plan.path_mm / MM_PER_M}
+    return String(data=json.dumps(document))
 
 
 def image(pixels: Pixels, header: Header) -> Image:  # [H, W]

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -72,6 +74,9 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         for name, (default, meaning) in OWN_PARAMETERS.items():
             self.declare_parameter(name, default, ParameterDescriptor(description=meaning, read_only=True))
         self.declare_parameter("scene", SCENE[0], ParameterDescriptor(description=SCENE[1]))
+        for name, default in parameters.plan_defaults().items():
+            meaning = f"{name.removeprefix(parameters.PLAN)} of the plan settings; -1 or empty: their default"
+            self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
         for name, default in parameters.defaults().items():
             meaning = f"{name} of the render settings; -1 or empty, where that is the default: as the scene has it"
             self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
@@ -81,6 +86,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         self._frames: NewestFrames[Header] | None = None
         self._poses: TransformedPoses | None = None
         self._subscription: Any = None
+        self._plan_subscription: Any = None
+        self._planner = ThreadPoolExecutor(1, "plan")  # a plan takes a second, in which frames go on
         self._last_pose: PoseStamped | None = None
         self._settings = RenderSettings()
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -112,6 +119,7 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         )
         try:
             self._take_poses()
+            self._plan_subscription = self.create_subscription(PoseStamped, "~/plan_from", self._plan, NEWEST)
         except ClientError as error:
             self.get_logger().error(str(error))
             self._stop()
@@ -150,11 +158,12 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
     def _stop(self) -> None:
         if self._poses is not None:
             self._poses.close()
-        if self._subscription is not None:
-            self.destroy_subscription(self._subscription)
+        for subscription in (self._subscription, self._plan_subscription):
+            if subscription is not None:
+                self.destroy_subscription(subscription)
         if self._frames is not None:
             self._frames.close()
-        self._poses = self._subscription = self._frames = None
+        self._poses = self._subscription = self._plan_subscription = self._frames = None
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -185,18 +194,44 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
 
     def _take(self, pose: PoseStamped) -> None:
         """A pose came. One that names another frame than the scene's would be taken for what it is not."""
-        scene_frame = self._value("scene_frame")
-        if pose.header.frame_id not in ("", scene_frame):
-            self._problems.tell(
-                "FRAME_REFUSED",
-                f"poses must be given in the frame {scene_frame!r}, got one in {pose.header.frame_id!r}: transform it, "
-                "or run the node with source tf",
-            )
+        if not self._is_in_scene(pose):
             return
         self._last_pose = pose
         if self._frames is not None:
             age_ns = (self.get_clock().now() - Time.from_msg(pose.header.stamp)).nanoseconds
             self._frames.render(messages.placement(pose), pose.header, age_ns / 1e9)
+
+    def _is_in_scene(self, pose: PoseStamped) -> bool:
+        scene_frame = self._value("scene_frame")
+        if pose.header.frame_id in ("", scene_frame):
+            return True
+        self._problems.tell(
+            "FRAME_REFUSED",
+            f"poses must be given in the frame {scene_frame!r}, got one in {pose.header.frame_id!r}: transform it, "
+            "or run the node with source tf",
+        )
+        return False
+
+    def _plan(self, start: PoseStamped) -> None:
+        """Where to look next was asked for, from where the probe is."""
+        if self._is_in_scene(start):
+            self._planner.submit(self._publish_plan, start)
+
+    def _publish_plan(self, start: PoseStamped) -> None:
+        values = {name: self._value(name) for name in parameters.plan_defaults()}
+        client, topics, frames = self._client, self._topics, self._settings
+        try:
+            asked = replace(parameters.plan_settings_of(values), probe=frames.probe)
+            if client is None or topics is None:
+                return
+            plan = client.plan_views(
+                self._value("scene"), asked, start=messages.placement(start), registration=frames.registration
+            )
+        except ClientError as error:
+            self._problems.tell(error.reason, f"no plan: {error.detail}")
+            return
+        if self.context.ok() and topics is self._topics:
+            topics.publish_plan(plan, Header(stamp=start.header.stamp, frame_id=self._value("scene_frame")))
 
     def _publish(self, frame: Frame, header: Header, replaced: int) -> None:
         if self._topics is None or not self.context.ok():  # told to stop while a frame was under way

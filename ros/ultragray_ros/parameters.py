@@ -15,12 +15,12 @@ from enum import Enum
 from types import NoneType
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
-from ultragray_client import PROBES, Display, RenderSettings
+from ultragray_client import PROBES, Display, PlanSettings, RenderSettings
 from ultragray_client.errors import InvalidArgument
 
 Value: TypeAlias = bool | int | float | str | list[str] | list[float]
 
-DISPLAY = "display."
+DISPLAY, PLAN = "display.", "plan."
 NEVER = "encoding"  # images are mono8
 NO_NUMBERS = [0.0]  # for an empty list of numbers: of one that is empty ROS cannot tell the type
 _LEFT_OPEN: dict[Any, Value] = {int: -1, float: -1.0}  # for what may be None; of all other kinds the empty text
@@ -28,7 +28,18 @@ _LEFT_OPEN: dict[Any, Value] = {int: -1, float: -1.0}  # for what may be None; o
 
 def defaults() -> dict[str, Value]:
     """The parameters by their names, with the values that leave everything as the scene has it."""
-    return {name: _default(item, kind) for name, item, kind in _entries()}
+    return {name: _default(item, kind) for name, item, kind in _entries(*_OF_FRAMES)}
+
+
+def plan_defaults() -> dict[str, Value]:
+    """The same of those of a plan."""
+    return {name: _default(item, kind) for name, item, kind in _entries(_OF_PLANS)}
+
+
+def plan_settings_of(values: Mapping[str, Any]) -> PlanSettings:
+    """What a plan is asked for by parameters; the service checks it."""
+    found = {name.removeprefix(PLAN): _read(name, kind, values[name]) for name, _, kind in _entries(_OF_PLANS)}
+    return PlanSettings(**found)
 
 
 def settings_of(values: Mapping[str, Any]) -> RenderSettings:
@@ -36,14 +47,18 @@ def settings_of(values: Mapping[str, Any]) -> RenderSettings:
 
     Raises InvalidArgument for a word or a probe that does not exist; the service checks the rest.
     """
-    found = {name: _read(name, kind, values[name]) for name, _, kind in _entries()}
+    found = {name: _read(name, kind, values[name]) for name, _, kind in _entries(*_OF_FRAMES)}
     display = Display(**{name.removeprefix(DISPLAY): found.pop(name) for name in tuple(found) if DISPLAY in name})
     return RenderSettings(**found, display=None if display == Display() else display)
 
 
-def _entries() -> Iterator[tuple[str, Field[Any], Any]]:
+_OF_FRAMES = (("", RenderSettings, (NEVER, "display")), (DISPLAY, Display, ()))
+_OF_PLANS = (PLAN, PlanSettings, ("probe", "plane"))  # the probe is that of the frames
+
+
+def _entries(*sources: tuple[str, type, tuple[str, ...]]) -> Iterator[tuple[str, Field[Any], Any]]:
     """Name, field and type of each parameter."""
-    for prefix, cls, left_out in (("", RenderSettings, (NEVER, "display")), (DISPLAY, Display, ())):
+    for prefix, cls, left_out in sources:
         hints = get_type_hints(cls)
         for item in fields(cls):
             if item.name not in left_out:

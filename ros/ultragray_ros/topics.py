@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -14,7 +14,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
-from ultragray_client import Frame
+from ultragray_client import Frame, ViewPlan
 from ultragray_client.errors import InvalidArgument, UnknownOutput
 from ultragray_ros import messages
 from ultragray_ros.messages import stamped_pose
@@ -24,8 +24,8 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Publishers:
-    """`~/OUTPUT` and `~/OUTPUT/compressed` of each output, `~/confidence`, and `~/geometry`, which is kept for whoever
-    comes later.
+    """`~/OUTPUT` and `~/OUTPUT/compressed` of each output, `~/confidence`, and what is kept for whoever comes later:
+    `~/geometry`, `~/plan` and `~/plan/report`.
     """
 
     def __init__(self, node: Node, probe_frame: str) -> None:
@@ -33,6 +33,8 @@ class Publishers:
         self._images: dict[str, tuple[Publisher, Publisher]] = {}
         self._confidence = node.create_publisher(DiagnosticArray, "~/confidence", qos_profile_sensor_data)
         self._geometry = node.create_publisher(String, "~/geometry", LATCHED)
+        self._plan = node.create_publisher(PoseArray, "~/plan", LATCHED)
+        self._plan_report = node.create_publisher(String, "~/plan/report", LATCHED)
         self._last_geometry: String | None = None
 
     def offer(self, outputs: tuple[str, ...]) -> None:
@@ -63,9 +65,14 @@ class Publishers:
             if compressed.get_subscription_count():
                 compressed.publish(messages.compressed_image(pixels, header))
 
+    def publish_plan(self, plan: ViewPlan, header: Header) -> None:
+        self._plan_report.publish(messages.plan_report(plan))
+        self._plan.publish(messages.planned_poses(plan, header))
+
     def close(self) -> None:
         """Take back the topics."""
-        for publisher in (self._confidence, self._geometry, *(one for pair in self._images.values() for one in pair)):
+        images = (one for pair in self._images.values() for one in pair)
+        for publisher in (self._confidence, self._geometry, self._plan, self._plan_report, *images):
             self._node.destroy_publisher(publisher)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from ultragray_client import Client, Display, RenderSettings
+from ultragray_client import Client, Display, PlanSettings, RenderSettings
 
 from ..surroundings import ROOT
 from ..waiting import wait_until
@@ -70,6 +70,30 @@ def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
     assert (geometry["height"], geometry["width"]) == expected.shape
     assert "takes poses from pose in the frame 'scene', and publishes frames of the scene 'demo' by " in node.log()
     assert node.stop() == 0
+
+
+def test_a_plan_is_published_for_whoever_asks_where_to_look_next(start_node, peer, ros_service):
+    from geometry_msgs.msg import PoseArray, PoseStamped
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
+
+    start_node(**{"address": ros_service.grpc, "plan.views": 3, "plan.within_mm": 0.5, "plan.tilt_deg": 20.0})
+    kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    plans, reports = peer.listen(PoseArray, "plan", kept), peer.listen(String, "plan/report", kept)
+    asking = peer.node.create_publisher(PoseStamped, "/ultragray/plan_from", 10)
+    start = PoseStamped()
+    start.header.frame_id, start.header.stamp.sec, start.pose.orientation.w = "scene", 7, 1.0
+    wait_until(asking.get_subscription_count)
+    asking.publish(start)
+    plan = wait_until(lambda: plans and plans[-1])
+    with Client(ros_service.grpc) as client:
+        asked = PlanSettings(views=3, within_mm=0.5, tilt_deg=20.0)
+        wanted = client.plan_views("demo", asked, start=np.eye(4))
+    assert (plan.header.frame_id, plan.header.stamp.sec) == ("scene", 7)
+    places = [(one.position.x, one.position.y, one.position.z) for one in plan.poses]
+    np.testing.assert_allclose(1000.0 * np.array(places), [one.pose[:3, 3] for one in wanted.views], atol=1e-6)
+    report = json.loads(wait_until(lambda: reports and reports[-1].data))
+    np.testing.assert_allclose(report["gains"], [one.gain for one in wanted.views])
 
 
 def test_the_command_of_the_launch_file_starts_the_node(start_node, peer, ros_service):

@@ -54,6 +54,15 @@ export async function assessPoses(scene: string, poses: readonly (readonly numbe
   return (await postJson("/v1/scenes/{scene}:assess", { scene }, { poses: poses.map(poseBody), probe })).extrapolations;
 }
 
+export type Planned = Schemas["Planned"];
+
+/** Views that would teach the scene most. `settings` are those of a plan; `start`: where the way begins; null: anywhere. */
+export function planViews(
+  scene: string, settings: Record<string, unknown>, start: readonly number[] | null, signal: AbortSignal,
+): Promise<Planned> {
+  return postJson("/v1/scenes/{scene}:plan", { scene }, { ...settings, start: start && poseBody(start) }, signal);
+}
+
 /** How far the start of a search may be off. */
 export interface Within {
   within_mm: number;

@@ -1,7 +1,7 @@
 /** What is drawn in space beside the Gaussians, as objects of three.js: box, sweep, skin, live image, probe, tools. */
 
 import {
-  BoxGeometry, BufferAttribute, BufferGeometry, CylinderGeometry, DataTexture, DoubleSide, Group, InstancedMesh,
+  BoxGeometry, BufferAttribute, BufferGeometry, Color, CylinderGeometry, DataTexture, DoubleSide, Group, InstancedMesh,
   LinearFilter, LineBasicMaterial, LineSegments, Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial,
   type Object3D, type Plane, RedFormat, ShaderMaterial, SphereGeometry, UnsignedByteType, Vector3,
 } from "three";
@@ -120,6 +120,31 @@ export function sweepPlanes(poses: readonly Pose[], lines: readonly Line[], cut:
   const stroke = new LineBasicMaterial({ color: SWEEP_COLOUR, transparent: true, opacity: 0.28 });
   planes.visible = filled;
   return new Group().add(planes, new LineSegments(outlines, stroke));
+}
+
+const PLAN_COLOURS = [new Color(0x6b4a86), new Color(0xf4d35e)] as const; // of the smallest and the largest gain
+const FAN_SHARE = 0.25; // of the depth: whole images would hide each other
+
+/** Views of a plan as little fans, the brighter the more they gain, and the way from face to face. */
+export function plannedViews(views: readonly { pose: Pose; gain: number }[], plane: ImagePlane): LineSegments {
+  const shape = planeShape(shortened(plane.lines_mm, FAN_SHARE));
+  const most = Math.max(...views.map(({ gain }) => gain), 0);
+  const [ends, colours, faces]: [number[], number[], Vector3[]] = [[], [], []];
+  const add = (point: Vector3, share: number): void => {
+    ends.push(...point.toArray());
+    colours.push(...PLAN_COLOURS[0].clone().lerp(PLAN_COLOURS[1], share).toArray());
+  };
+  for (const { pose, gain } of views) {
+    const matrix = matrixOf(pose);
+    for (const corner of shape.outline) add(new Vector3().fromArray(shape.positions, corner * 3).applyMatrix4(matrix), gain / most);
+    faces.push(new Vector3(0, 0, plane.pivot_depth_mm).applyMatrix4(matrix));
+  }
+  for (const [index, face] of faces.entries()) if (index > 0) for (const end of [faces[index - 1]!, face]) add(end, 0.5);
+  const geometry = new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
+  geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
+  const lines = new LineSegments(geometry, new LineBasicMaterial({ vertexColors: true, depthTest: false, transparent: true }));
+  lines.renderOrder = TRACE.order; // tissue does not hide where to go
+  return lines;
 }
 
 export function skinMesh(skin: Skin): Mesh<BufferGeometry, MeshLambertMaterial> {

@@ -16,7 +16,7 @@ import {
   type Appearance, type Box, type Cut, type CutAcross, type Form, type Look, lookFrom, type Sides,
   type Viewpoint,
 } from "./appearance";
-import { boxLines, drop, LiveImage, skinMesh, sweepPlanes, ToolBodies } from "./bodies";
+import { boxLines, drop, LiveImage, plannedViews, skinMesh, sweepPlanes, ToolBodies } from "./bodies";
 import { Cloud, OCCLUDERS, type Sight } from "./cloud";
 import { type Gizmo, pointedAt, ProbeHandle } from "./probe_handle";
 import type { Volume } from "./volume";
@@ -290,6 +290,7 @@ export class SpaceView {
   #sweep: Group | null = null;
   #outline: LineSegments | null = null;
   #skin: Mesh | null = null;
+  #plan: LineSegments | null = null;
   /** Whether the person has put the eye where it is. */
   #steers = false;
 
@@ -339,7 +340,7 @@ export class SpaceView {
     this.#cloud.dispose();
     this.#image.dispose();
     this.#tools.dispose();
-    for (const object of [this.#sweep, this.#outline, this.#skin]) if (object) drop(object);
+    for (const object of [this.#sweep, this.#outline, this.#skin, this.#plan]) if (object) drop(object);
     this.#renderer.domElement.removeEventListener("webglcontextrestored", this.#restored);
     this.#renderer.dispose();
     this.#renderer.domElement.remove();
@@ -373,6 +374,13 @@ export class SpaceView {
     if (this.#skin) drop(this.#skin);
     this.#skin = skin && skinMesh(skin);
     if (this.#skin) this.#scene.add(this.#skin);
+    this.#acted();
+  }
+
+  setPlan(views: readonly { pose: Pose; gain: number }[], plane: ImagePlane | null): void {
+    if (this.#plan) drop(this.#plan);
+    this.#plan = plane && plannedViews(views, plane);
+    if (this.#plan) this.#scene.add(this.#plan);
     this.#acted();
   }
 

@@ -240,6 +240,11 @@ const sentences = {
     },
     open: (scene: string): string => `Open ${scene}`,
   },
+  plan: {
+    found: (count: number, before: string, after: string, path_mm: string): string =>
+      `${count} views, ${before} → ${after}, ${path_mm} mm of way`,
+    view: (number: number, gain: string, rank: number): string => `${number}: +${gain} (gain number ${rank})`,
+  },
   locate: {
     size: (width: number, height: number): string => `${width} × ${height} pixels; choose another one here`,
     notPng: (name: string): string => `${name} is not a PNG file.`,
