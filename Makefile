@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing confidence speckle prediction preview planning environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -242,6 +242,12 @@ preview: $(VENV)/installed-dev  ## what an operator sees while real frames come 
 	$(BIN)/python benchmarks/preview.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show preview
 	$(KEEP) preview
+
+live: $(VENV)/installed-dev  ## how soon a scene shows what is being scanned, and how well in the end, beside `fast`; half an hour
+	$(READY)
+	$(BIN)/python benchmarks/live.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show live
+	$(KEEP) live
 
 planning: $(VENV)/installed-dev  ## half the frames, planned, against an even raster of the phantom, over ten seeds, and the time of a plan; takes half an hour
 	$(READY)

@@ -27,6 +27,7 @@ import compressed
 import confidence
 import editing
 import hand
+import live
 import localization
 import measuring
 import methods_tables
@@ -55,7 +56,7 @@ TARGETS = {
         name: name
         for name in (
             *("ablations", "poses", "hand", "localization", "confidence"),
-            *("speckle", "environment", "prediction", "preview", "planning", "ros"),
+            *("speckle", "environment", "prediction", "preview", "live", "planning", "ros"),
         )
     },
     "compressed": "compressed",
@@ -367,6 +368,7 @@ BLOCKS = {
     "frames in a page": Block("browser", frames_in_a_page),
     "operations of a frame": Block("cuda", operations_of_a_frame),
     "environment": Block("environment", environment),
+    "live scenes": Block("live", live.live_scenes),
     "foretold poses": Block("prediction", prediction.foretold_poses),
     "previewed frames": Block("preview", preview.previewed_frames),
     "planned views": Block("planning", planning.planned_and_even),

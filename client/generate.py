@@ -31,7 +31,9 @@ from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
 from ultragray.scene.edits import Edit
 from ultragray_service.core.clocks import ClockOffset
+from ultragray_service.core.recordings import RecordingView
 from ultragray_service.errors import STATUSES
+from ultragray_workers.datasets.recording import RecordingSettings
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
 
@@ -50,6 +52,8 @@ ROOTS = {
     "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,
     "Dataset": DatasetRecord,
+    "RecordingSettings": RecordingSettings,
+    "RecordingView": RecordingView,
     "Specification": Specification,
     "Edit": Edit,
 }

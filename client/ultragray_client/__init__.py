@@ -11,9 +11,10 @@ from ultragray_client import contract, errors
 from ultragray_client.client import AsyncClient, Client
 from ultragray_client.connection import Tls
 from ultragray_client.contract import *  # noqa: F403
+from ultragray_client.conversations import RecordingAnswer
 from ultragray_client.errors import ClientError
 from ultragray_client.exchange import StreamMode
-from ultragray_client.frames import Frame, Localization, PlannedView, Slice, Timings, ViewPlan
+from ultragray_client.frames import Frame, Localization, PlannedView, RealFrame, Slice, Timings, ViewPlan
 from ultragray_client.geometry import Picture, Placement, PoseLike, Quaternion
 from ultragray_client.holding import HoldStill
 from ultragray_client.poses import check_poses, pose_from_position_quaternion, quaternion_from_pose
@@ -59,7 +60,9 @@ __all__ = [
     "PlannedView",
     "PoseLike",
     "Quaternion",
+    "RealFrame",
     "Recording",
+    "RecordingAnswer",
     "Registration",
     "Role",
     "Scene",

@@ -22,16 +22,19 @@ from ultragray_client.contract import (
     Extrapolation,
     PlanSettings,
     Probe,
+    RecordingSettings,
+    RecordingView,
     RenderSettings,
     SliceSettings,
     Specification,
 )
-from ultragray_client.conversations import Batch, LastJob, Upload, Watch, download_into
+from ultragray_client.conversations import Batch, LastJob, Recorder, RecordingAnswer, Upload, Watch, download_into
 from ultragray_client.errors import InvalidPose
 from ultragray_client.exchange import PoseExchange, StreamMode
 from ultragray_client.frames import (
     Frame,
     Localization,
+    RealFrame,
     Slice,
     ViewPlan,
     frame_from_message,
@@ -76,6 +79,7 @@ from ultragray_proto.v1 import (
     datasets_pb2,
     geometry_pb2,
     jobs_pb2,
+    recordings_pb2,
     registrations_pb2,
     rendering_pb2,
     scenes_pb2,
@@ -202,6 +206,52 @@ class Datasets(Group[AnyConnection]):
     def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
         """Raises DatasetInUse where a job needs it."""
         return Deletion("DatasetService.DeleteDataset", datasets_pb2.DeleteDatasetRequest(dataset=name), timeout_s)
+
+
+class Recordings(Group[AnyConnection]):
+    """`client.recordings`: datasets that are still open. All raise ClientError; of no such name DatasetNotFound."""
+
+    @operation
+    def begin(
+        self, name: str, settings: RecordingSettings, *, private: bool = False, timeout_s: float | None = None
+    ) -> Call[RecordingView]:
+        """Begins a recording under the name of the dataset that it becomes; of one that was begun with these settings,
+        how far it is. Others do not see a `private` one. Raises DatasetExists, LimitReached.
+        """
+        request = recordings_pb2.BeginRecordingRequest(
+            dataset=name, settings=message_of(settings, recordings_pb2.RecordingSettings), private=private
+        )
+        return Call("RecordingService.BeginRecording", request, _one(RecordingView), timeout_s)
+
+    @operation
+    def get(self, name: str, *, timeout_s: float | None = None) -> Call[RecordingView]:
+        """How far a recording is."""
+        request = recordings_pb2.GetRecordingRequest(dataset=name)
+        return Call("RecordingService.GetRecording", request, _one(RecordingView), timeout_s)
+
+    @operation
+    def record(
+        self, name: str, frames: Iterable[RealFrame], *, timeout_s: float | None = None
+    ) -> Talk[RecordingAnswer]:
+        """Adds frames as they come from an iterator, and tells whenever more of them is stored.
+
+        An answer also tells of a frame that cannot be recorded, such as one without echo: the others go on. Where the
+        connection is lost, or the service is restarted, frames that are not known to be stored are sent again. One
+        client may record at a time. Raises RecordingTaken, LimitReached, StorageFull.
+        """
+        return Talk("RecordingService.RecordFrames", Recorder(name, frames), timeout_s)
+
+    @operation
+    def finish(self, name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
+        """Makes a recording a dataset, checked as an upload is. Raises DatasetInvalid."""
+        request = recordings_pb2.FinishRecordingRequest(dataset=name)
+        return Call("RecordingService.FinishRecording", request, _one(Dataset), timeout_s)
+
+    @operation
+    def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Raises DatasetInUse where a live job follows it."""
+        request = recordings_pb2.DeleteRecordingRequest(dataset=name)
+        return Deletion("RecordingService.DeleteRecording", request, timeout_s)
 
 
 class Jobs(Group[AnyConnection]):
@@ -393,6 +443,7 @@ class _Client(Group[AnyConnection]):
         super().__init__(self._connects(address, api_key, tls, timeout_s))
         self.scenes: Scenes[AnyConnection] = Scenes(self._connection)
         self.datasets: Datasets[AnyConnection] = Datasets(self._connection)
+        self.recordings: Recordings[AnyConnection] = Recordings(self._connection)
         self.jobs: Jobs[AnyConnection] = Jobs(self._connection)
         self.workers: Workers[AnyConnection] = Workers(self._connection)
         self.registrations: Registrations[AnyConnection] = Registrations(self._connection)

@@ -45,6 +45,7 @@ __all__ = [
     "LabelShape",
     "LesionsEdit",
     "LinearProbe",
+    "LiveJob",
     "MapShape",
     "MergeEdit",
     "MeshShape",
@@ -57,6 +58,9 @@ __all__ = [
     "Preview",
     "Probe",
     "RadialProbe",
+    "RecordingSettings",
+    "RecordingState",
+    "RecordingView",
     "RelabelEdit",
     "RenderJob",
     "RenderSettings",
@@ -496,6 +500,35 @@ class Dataset:
 
 
 @dataclass(frozen=True)
+class RecordingSettings:
+    """What all frames of a recording have in common."""
+
+    probe: Probe  # The probe that takes the frames.
+    image_height: int  # Rows of a frame, along depth.
+    image_width: int  # Columns of a frame, across scan lines.
+
+
+@dataclass(frozen=True)
+class RecordingState:
+    """How far a recording is. What it tells is stored."""
+
+    name: str  # Also of the dataset that it becomes.
+    settings: RecordingSettings  # As it was begun.
+    frames: int  # That are stored.
+    next_number: int  # Least number that the next frame may have: those before it were stored, or are lost.
+    bytes: int  # Of its blocks.
+    created_at: str  # ISO 8601, UTC.
+
+
+@dataclass(frozen=True)
+class RecordingView(RecordingState):
+    """How far a recording is. What it tells is stored."""
+
+    owner: str | None = None  # Who records it; null: nobody who is known.
+    private: bool = False  # Whether others may not see it.
+
+
+@dataclass(frozen=True)
 class ComparisonSettings:
     """Settings of a comparison."""
 
@@ -543,6 +576,27 @@ class EvaluateJob:
     baselines: bool = False
     register: bool = False  # Also move each frame by one half of it, and score the other half: minutes.
     kind: Literal["evaluate"] = field_of(default="evaluate", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
+    max_run_s: float | None = field_of(default=None, kw_only=True)
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
+    device: str = field_of(default="auto", kw_only=True)
+    # Least memory of the device, 10^9 bytes; of cpu: of the host.
+    min_memory_gb: int | None = field_of(default=None, kw_only=True)
+    # Labels that the worker must have, such as {"site": "lab1"}.
+    worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
+
+
+@dataclass(frozen=True)
+class LiveJob:
+    """A recording becomes a scene while its frames arrive, served in versions from the first frames on.
+
+    When the recording is finished, it ends as a training of the preset `fast` does.
+    """
+
+    recording: str  # Name of a recording that is open; of a dataset: it is trained from as a whole.
+    scene: str  # Name that the scene is served under, each version in the place of the one before.
+    version_every_s: float = 1.0  # Least time between two versions, s.
+    kind: Literal["live"] = field_of(default="live", repr=False, kw_only=True)
     # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
     # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
@@ -702,7 +756,7 @@ class VoxelizeJob:
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
 
 
-Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob | VoxelizeJob
+Specification: TypeAlias = CompareJob | EvaluateJob | LiveJob | RenderJob | TrainJob | VoxelizeJob
 
 
 @dataclass(frozen=True, kw_only=True)

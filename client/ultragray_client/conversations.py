@@ -6,21 +6,24 @@ import contextlib
 import os
 import re
 import secrets
+import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from ultragray_client.connection import Retries
-from ultragray_client.contract import DatasetOptions
+from ultragray_client.connection import Retries, error_of_frame
+from ultragray_client.contract import DatasetOptions, RecordingView
 from ultragray_client.errors import ClientError, InvalidArgument, TooManyPoses, Unreachable
-from ultragray_client.frames import Frame, frame_from_message
+from ultragray_client.frames import Frame, RealFrame, frame_from_message
 from ultragray_client.geometry import PoseLike, pose_messages
 from ultragray_client.messages import message_of
 from ultragray_client.records import Job, JobEvent, job_from_message
-from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2
+from ultragray_proto.codec import from_message
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, recordings_pb2, rendering_pb2
 
 T = TypeVar("T")
 _POSES_PER_CALL = 256  # halved where the service takes fewer
@@ -97,6 +100,91 @@ class Batch(Conversation[Frame]):
 
 _CHUNK_BYTES = 2**20
 _ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
+
+
+@dataclass(frozen=True)
+class RecordingAnswer:
+    """How far a recording is, and why a frame is none of it."""
+
+    recording: RecordingView
+    error: ClientError | None  # with the number of the frame as its `sequence`
+
+
+class Recorder(Conversation[RecordingAnswer]):
+    """Real frames on their way into a recording: those that are not known to be stored are sent again.
+
+    Messages are made in the thread of a call. That of a call which broke may still wait for the caller's next frame; it
+    leaves that frame to the call after it.
+    """
+
+    def __init__(self, name: str, frames: Iterable[RealFrame]) -> None:
+        self._name, self._frames = name, iter(frames)
+        self._unstored: deque[recordings_pb2.IncomingFrame] = deque()
+        self._next_number = 0
+        self._has_ended = False  # the caller's frames
+        self._call = 0  # its number
+        self._is_answered = threading.Event()  # the call that is open; then the number of the next frame is known
+        self._taking, self._changing = threading.Lock(), threading.Lock()
+
+    def request(self) -> Iterator[recordings_pb2.RecordFramesRequest] | None:
+        """The messages of the next call; None when all frames are stored."""
+        if self._has_ended and not self._unstored:
+            return None
+        self._is_answered.clear()
+        return self._messages(self._call)
+
+    def take(self, message: recordings_pb2.RecordFramesResponse) -> RecordingAnswer:
+        """How far the recording is, or why a frame is none of it."""
+        recording, error = from_message(message.recording, RecordingView), None
+        with self._changing:
+            self._next_number = max(self._next_number, recording.next_number)
+            while self._unstored and self._unstored[0].number < recording.next_number:
+                self._unstored.popleft()
+            if message.HasField("error"):
+                error = error_of_frame(message.error, message.refused_number)
+                self._unstored = deque(one for one in self._unstored if one.number != message.refused_number)
+        self._is_answered.set()
+        return RecordingAnswer(recording, error)
+
+    def end_of_call(self) -> None:
+        """Notes that the messages of the call are over."""
+        self._call += 1
+        self._is_answered.set()
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
+        """The seconds to wait before the next call."""
+        self.end_of_call()
+        return super().pause_s(error, retries)
+
+    def _messages(self, call: int) -> Iterator[recordings_pb2.RecordFramesRequest]:
+        request, sent = recordings_pb2.RecordFramesRequest, -1
+        yield request(dataset=self._name)
+        self._is_answered.wait()
+        while call == self._call:
+            with self._taking:
+                with self._changing:
+                    waiting = [frame for frame in self._unstored if frame.number > sent]
+                if not waiting and (frame := self._next()) is not None:
+                    waiting = [frame]
+            if not waiting:
+                return
+            for one in waiting:
+                sent = one.number
+                yield request(frame=one)
+
+    def _next(self) -> recordings_pb2.IncomingFrame | None:
+        """The caller's next frame, with its number; None after the last one. Raises InvalidArgument, InvalidPose."""
+        frame = None if self._has_ended else next(self._frames, None)
+        if frame is None:
+            self._has_ended = True
+            return None
+        message = frame.message()
+        with self._changing:
+            if frame.number is None:
+                message.number = self._next_number
+            self._next_number = max(self._next_number, message.number + 1)
+            self._unstored.append(message)
+        return message
 
 
 class Upload:

@@ -47,6 +47,8 @@ ClientError
 │   ├── DatasetExists
 │   ├── SceneExists
 │   └── RequestIdConflict
+├── Aborted
+│   └── RecordingTaken
 ├── ResourceExhausted
 │   ├── StorageFull
 │   ├── MemoryExceeded
@@ -251,6 +253,14 @@ class SceneExists(AlreadyExists):
 
 class RequestIdConflict(AlreadyExists):
     """The `request_id` was used for something else."""
+
+
+class Aborted(ClientError):
+    """Base of the errors whose gRPC status is ABORTED."""
+
+
+class RecordingTaken(Aborted):
+    """Two record into one recording at a time; one may."""
 
 
 class ResourceExhausted(ClientError):

@@ -29,7 +29,7 @@ from ultragray_client.errors import InvalidArgument
 from ultragray_client.geometry import FloatArray, PoseLike, pose_message, pose_messages
 from ultragray_client.messages import message_of
 from ultragray_proto.codec import from_message, words
-from ultragray_proto.v1 import rendering_pb2
+from ultragray_proto.v1 import recordings_pb2, rendering_pb2
 
 _PIXEL_TYPES: dict[str, np.dtype[Any]] = {
     Encoding.UINT8: np.dtype("u1"),
@@ -233,6 +233,39 @@ def plan_message(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class RealFrame:
+    """A frame as a probe took it: rows along depth, columns across scan lines, not scan-converted."""
+
+    image: npt.ArrayLike | bytes  # grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file
+    pose: PoseLike  # of the probe, in the frame of the tracker
+    time_s: float | None = None  # when it was taken
+    number: int | None = None  # in the caller's count, which grows; one that is missing is a lost frame. None: the next
+
+    def message(self) -> recordings_pb2.IncomingFrame:
+        """The message of the frame. Raises InvalidArgument for what is no grey image, and InvalidPose."""
+        image = self.image if isinstance(self.image, bytes) else grey_pixels(self.image).tobytes()
+        return recordings_pb2.IncomingFrame(
+            number=self.number, pose=pose_message(self.pose), time_s=self.time_s, image=image
+        )
+
+
+def grey_pixels(image: npt.ArrayLike) -> npt.NDArray[np.uint8]:  # [H, W]
+    """Grey values as uint8. Raises InvalidArgument for what is no grey image."""
+    pixels = np.asarray(image)
+    if pixels.ndim != 2 or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
+        raise InvalidArgument(
+            "image must be the bytes of a PNG file or grey values [H, W], uint8 or floating point, "
+            f"got {pixels.dtype} {list(pixels.shape)}",
+            field="image",
+        )
+    if pixels.dtype != np.uint8:
+        if not (np.isfinite(pixels).all() and pixels.min(initial=0.0) >= 0.0 and pixels.max(initial=0.0) <= 1.0):
+            raise InvalidArgument("image of floating point must hold finite values in [0, 1]", field="image")
+        pixels = np.rint(255.0 * pixels).astype(np.uint8)
+    return pixels
+
+
 def localize_message(
     scene: str,
     image: npt.ArrayLike | bytes,
@@ -254,16 +287,6 @@ def put_image(request: Any, image: npt.ArrayLike | bytes) -> None:
     if isinstance(image, bytes):
         request.image = image
         return
-    pixels = np.asarray(image)
-    if pixels.ndim != 2 or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
-        raise InvalidArgument(
-            "image must be the bytes of a PNG file or grey values [H, W], uint8 or floating point, "
-            f"got {pixels.dtype} {list(pixels.shape)}",
-            field="image",
-        )
-    if pixels.dtype != np.uint8:
-        if not (np.isfinite(pixels).all() and pixels.min(initial=0.0) >= 0.0 and pixels.max(initial=0.0) <= 1.0):
-            raise InvalidArgument("image of floating point must hold finite values in [0, 1]", field="image")
-        pixels = np.rint(255.0 * pixels).astype(np.uint8)
+    pixels = grey_pixels(image)
     request.image = pixels.tobytes()
     request.image_height, request.image_width = pixels.shape

@@ -96,6 +96,10 @@ class Connection(Terms):
         with client_errors(self.address):
             return self.method(method)(content, timeout=timeout_s, metadata=metadata)
 
+    def content(self, request: Any) -> Any:
+        """What a call is given: a message, or an iterator of messages whose making may wait."""
+        return request
+
     async def next_message(self, call: Any) -> Any:
         """The next message of a call whose answer is a stream; None after the last one."""
         return next(call, None)
@@ -131,9 +135,11 @@ class AsyncConnection(Connection):
         return talk.results(self)
 
     async def attempt(self, method: str, content: Any, timeout_s: float | None, metadata: Metadata) -> Any:
-        content = _read_in_threads(content) if isinstance(content, Iterator) else content
         with client_errors(self.address):
-            return await self.method(method)(content, timeout=timeout_s, metadata=metadata)
+            return await self.method(method)(self.content(content), timeout=timeout_s, metadata=metadata)
+
+    def content(self, request: Any) -> Any:
+        return _read_in_threads(request) if isinstance(request, Iterator) else request
 
     async def next_message(self, call: Any) -> Any:
         message = await call.read()
@@ -147,7 +153,7 @@ class AsyncConnection(Connection):
 
 
 async def _read_in_threads(messages: Iterator[T]) -> AsyncIterator[T]:
-    """Messages whose making waits for the disk."""
+    """Messages whose making waits, such as for the disk."""
     while (message := await asyncio.to_thread(next, messages, None)) is not None:
         yield message
 
@@ -247,7 +253,8 @@ class Talk(Generic[T]):
         while (request := conversation.request()) is not None:
             try:
                 metadata = connection.metadata(request)
-                call = connection.method(self.method)(request, timeout=retries.remaining_s(), metadata=metadata)
+                content = connection.content(request)
+                call = connection.method(self.method)(content, timeout=retries.remaining_s(), metadata=metadata)
                 try:
                     with client_errors(connection.address):
                         while (message := await connection.next_message(call)) is not None:

@@ -144,6 +144,7 @@ STATUSES = {  # by the reason of the error
     "DATASET_INVALID": Statuses(422, "INVALID_ARGUMENT"),
     "DATASET_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "DATASET_EXISTS": Statuses(409, "ALREADY_EXISTS"),
+    "RECORDING_TAKEN": Statuses(409, "ABORTED"),
     "DATASET_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
     "UPLOAD_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
     "STORAGE_FULL": Statuses(507, "RESOURCE_EXHAUSTED"),

@@ -26,6 +26,7 @@ from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
+from ultragray_service.core.recordings import OpenRecordings
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Rendering, RequestPlanner
 from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
@@ -66,6 +67,7 @@ class Service:
     registrations: Registrations
     jobs: Jobs
     uploads: DatasetUploads
+    recordings: OpenRecordings
     imports: SceneImports
     labels: SceneLabels
     edits: SceneEdits

@@ -20,6 +20,7 @@ from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
+from ultragray_service.core.recordings import OpenRecordings
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Rendering, RequestPlanner
 from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
@@ -74,7 +75,7 @@ def make_service(settings: Settings) -> Service:
         sessions,
         owners,
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
-        {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
+        {Kind.SCENE: scenes.require, Kind.DATASET: datasets.require},
     )
     # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
     # labels a scene, one edits scenes, and one draws thumbnails, which would wait behind pictures for minutes.
@@ -103,6 +104,7 @@ def make_service(settings: Settings) -> Service:
         registrations=registrations,
         jobs=jobs,
         uploads=DatasetUploads(datasets, means),
+        recordings=OpenRecordings(datasets, means),
         imports=imports,
         labels=SceneLabels(scenes, imports, registrations, owners, labelling, life),
         edits=SceneEdits(scenes, imports, owners, editing, life),

@@ -25,6 +25,10 @@ class DatasetExists(UltragrayError, title="Another dataset has that name"):
     """A dataset of that name has another content or other options; delete it first."""
 
 
+class RecordingTaken(UltragrayError, title="Somebody else records there"):
+    """Two record into one recording at a time; one may."""
+
+
 class DatasetInUse(UltragrayError, title="Dataset in use"):
     """A job needs the dataset."""
 

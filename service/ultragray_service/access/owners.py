@@ -62,6 +62,12 @@ class Owners:
         except LookupError:  # the service itself
             return False
 
+    def require_change(self, kind: Kind, name: str) -> None:
+        """Raises PermissionDenied where the running code works for somebody who may not change a dataset or scene."""
+        principal, ownership = acting(), self.known(kind, name)
+        if not may_change(principal, ownership):
+            raise _not_theirs(f"a change of the {kind.value}", kind, name, ownership)
+
     async def claim(
         self, kind: Kind, name: str, ownership: Ownership, is_there: Callable[[str | None], Awaitable[bool]]
     ) -> bool:
@@ -207,9 +213,12 @@ class Admission:
         if operation.owned and not may_change(principal, ownership):
             if about in self._find:  # something that is not there, or hidden, is nobody's
                 await asyncio.to_thread(self._find[about], name)
-            whose = "nobody's" if ownership.owner is None else f"{ownership.owner}'s"
-            raise PermissionDenied(
-                f"{operation.name} needs the role {Role.ADMIN.value}, or to be the owner's: the {about.value} "
-                f"{name[:128]!r} is {whose}",
-                field=about.value,
-            )
+            raise _not_theirs(operation.name, about, name, ownership)
+
+
+def _not_theirs(what: str, kind: Kind, name: str, ownership: Ownership) -> PermissionDenied:
+    whose = "nobody's" if ownership.owner is None else f"{ownership.owner}'s"
+    return PermissionDenied(
+        f"{what} needs the role {Role.ADMIN.value}, or to be the owner's: the {kind.value} {name[:128]!r} is {whose}",
+        field=kind.value,
+    )

@@ -128,6 +128,29 @@ OPERATIONS = (
         "POST /v1/datasets/{dataset}:simulate",
         "DatasetService/UploadDataset",
     ),
+    _operation("recording.begin", _OPERATOR, "PUT /v1/recordings/{dataset}", "RecordingService/BeginRecording"),
+    _operation("recording.get", _READER, "GET /v1/recordings/{dataset}", "RecordingService/GetRecording"),
+    _operation(
+        "recording.add",
+        _OPERATOR,
+        "POST /v1/recordings/{dataset}/frames",
+        f"{WEBSOCKET} /v1/recordings/{{dataset}}/stream",
+        "RecordingService/RecordFrames",  # its first message names the recording: the owner is looked up then
+    ),
+    _operation(
+        "recording.finish",
+        _OPERATOR,
+        "POST /v1/recordings/{dataset}:finish",
+        "RecordingService/FinishRecording",
+        owned=True,
+    ),
+    _operation(
+        "recording.delete",
+        _OPERATOR,
+        "DELETE /v1/recordings/{dataset}",
+        "RecordingService/DeleteRecording",
+        owned=True,
+    ),
     _operation(
         "dataset.delete", _OPERATOR, "DELETE /v1/datasets/{dataset}", "DatasetService/DeleteDataset", owned=True
     ),

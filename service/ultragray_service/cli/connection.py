@@ -185,6 +185,12 @@ class Connection:
             with self._ask("PUT", route, body, headers, _CHECK_TIMEOUT_S) as answer:
                 return self._document(self.whole(answer)), answer.status == 201
 
+    def post(self, route: str, body: bytes) -> Any:
+        """The JSON of the answer to bytes."""
+        headers = {"Content-Type": "application/octet-stream"}
+        with self._ask("POST", route, body, headers, _TIMEOUT_S) as answer:
+            return self._document(self.whole(answer))
+
     def _ask(
         self, method: str, route: str, body: bytes | _Counted | None, headers: Mapping[str, str], timeout_s: float
     ) -> http.client.HTTPResponse:

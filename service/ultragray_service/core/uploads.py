@@ -127,7 +127,7 @@ class Quotas:
         dataset_bytes = 0
         for name in self._owners.owned(Kind.DATASET, owner):
             with suppress(UltragrayError):  # a damaged one, or one that has just gone
-                dataset_bytes += self._datasets.get(name).bytes
+                dataset_bytes += self._datasets.bytes_of(name)
         scenes = [self._scenes.stored(name) for name in self._owners.owned(Kind.SCENE, owner)]
         sizes = dict(filter(None, scenes))  # a scene and the artifact that it was are one content
         sizes |= {file.stored.sha256: file.stored.bytes for file in jobs.artifact_files_of(owner)}

@@ -32,12 +32,14 @@ from ultragray.geometry.probe import Probe
 from ultragray.learn.training.config import PRESETS, TrainingConfig
 from ultragray.rendering.volumes import SliceSettings
 from ultragray_service.access.rules import WEBSOCKET, HttpRules
+from ultragray_service.core.recordings import RecordingAnswer
 from ultragray_service.errors import RouteNotFound
 from ultragray_service.http import problems
 from ultragray_service.http.bodies import (
     SPECIFICATIONS,
     AssessBody,
     EditBody,
+    FrameHead,
     JobBody,
     LabelBody,
     LabelMapBody,
@@ -50,10 +52,11 @@ from ultragray_service.http.bodies import (
 )
 from ultragray_service.http.dependencies import revalidated
 from ultragray_service.http.middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from ultragray_service.http.routes import datasets, geometry, health, jobs, rendering, scenes, streams
+from ultragray_service.http.routes import datasets, geometry, health, jobs, recordings, rendering, scenes, streams
 from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
 from ultragray_service.service import Service
 from ultragray_service.telemetry.logs import Tracing
+from ultragray_workers.datasets.recording import RecordingSettings
 from ultragray_workers.storage.local import FileVersion
 
 DOCS_PATH = "/docs"
@@ -216,6 +219,7 @@ _ROUTERS = (
     geometry.registrations_router,
     datasets.router,
     datasets.comparison_router,
+    recordings.router,
     jobs.router,
     jobs.workers_router,
     streams.streams_router,
@@ -235,13 +239,15 @@ _READ: tuple[Any, ...] = (
     EditBody,
     LabelMapBody,
     RegistrationBody,
+    FrameHead,
+    RecordingSettings,
     StreamMessage,
     JobBody,
     *SPECIFICATIONS,
     TrainingConfig,
     Probe,
 )
-_WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
+_WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage, RecordingAnswer)
 
 
 def create_app(service: Service) -> FastAPI:

@@ -34,6 +34,7 @@ from ultragray_service.core.clocks import ClockStamps
 from ultragray_service.core.editing import EditTarget
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
+from ultragray_service.core.recordings import MAX_NUMBER, IncomingFrame
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
 from ultragray_service.http.dependencies import require_uncompressed
@@ -411,6 +412,37 @@ class StreamMessage(Contract):
         low=0,
         high=2**64 - 1,
     )
+
+
+_HEAD_LENGTH_BYTES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameHead(Contract):
+    """The JSON before the image of a real frame."""
+
+    pose: Pose = described("Of the probe, in the frame of the tracker.", error=InvalidPose)
+    number: int | None = described(
+        "In the sender's count, which grows; one that is missing is a lost frame. Default: the next.",
+        None,
+        low=0,
+        high=MAX_NUMBER,
+    )
+    time_s: float | None = described("When it was taken.", None)
+
+
+def read_incoming_frame(body: bytes) -> IncomingFrame:
+    """A real frame: the length of the JSON that follows (uint32, little endian), a FrameHead as JSON, the image.
+
+    As frames are sent over a stream. Raises InvalidArgument and its kinds.
+    """
+    start = _HEAD_LENGTH_BYTES + int.from_bytes(body[:_HEAD_LENGTH_BYTES], "little")
+    if not _HEAD_LENGTH_BYTES < start <= min(len(body), INLINE_BYTES):
+        raise InvalidArgument(
+            "a frame must be the length of its JSON (uint32, little endian), the JSON and the image", field="body"
+        )
+    head = read_json(body[_HEAD_LENGTH_BYTES:start].decode("utf-8", "replace"), FrameHead)
+    return IncomingFrame(pose=head.pose.exact("pose"), image=body[start:], number=head.number, time_s=head.time_s)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,17 +19,19 @@ from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.registration import Registration, rows
 from ultragray_proto.codec import to_message
-from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, recordings_pb2
 from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_service.access.principals import Me, me
 from ultragray_service.core.editing import EditTarget
 from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
 from ultragray_service.core.labelling import LabelTarget
+from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, record
 from ultragray_service.core.registrations import NamedRegistration
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.rpc.messages import OfProbe, job_message, read, read_pose, read_specification, read_word
 from ultragray_service.service import Service
+from ultragray_workers.datasets.recording import RecordingSettings
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.workers import Wanted
@@ -53,6 +55,24 @@ async def _contact_sheet(service: Service, request: Any) -> Mapping[str, Any]:
 
 async def _delete_dataset(service: Service, request: Any) -> Mapping[str, Any]:
     await service.delete_dataset(request.dataset)
+    return {"dataset": request.dataset}
+
+
+async def _begin_recording(service: Service, request: Any) -> Any:
+    service.life.require_serving()
+    with under("settings"):
+        settings = read(request.settings, RecordingSettings)
+    return await service.recordings.begin(request.dataset, settings, private=request.private)
+
+
+async def _finish_recording(service: Service, request: Any) -> datasets_pb2.Dataset:
+    service.life.require_serving()
+    record = await service.recordings.finish(request.dataset)
+    return to_message(service.datasets.with_owner(record), datasets_pb2.Dataset)
+
+
+async def _delete_recording(service: Service, request: Any) -> Mapping[str, Any]:
+    await service.recordings.delete(request.dataset)
     return {"dataset": request.dataset}
 
 
@@ -161,6 +181,10 @@ CALLS: Mapping[str, Call] = {
     "DatasetService.GetDataset": lambda service, request: service.datasets.get(request.dataset),
     "DatasetService.GetContactSheet": _contact_sheet,
     "DatasetService.DeleteDataset": _delete_dataset,
+    "RecordingService.BeginRecording": _begin_recording,
+    "RecordingService.GetRecording": lambda service, request: service.recordings.get(request.dataset),
+    "RecordingService.FinishRecording": _finish_recording,
+    "RecordingService.DeleteRecording": _delete_recording,
     "JobService.SubmitJob": _submit_job,
     "JobService.EstimateJob": _estimate_job,
     "JobService.ListJobs": _list_jobs,
@@ -218,6 +242,31 @@ async def _receive(context: Context, upload: DatasetUpload, *, archive: bool) ->
             raise InvalidArgument(f"a message after the header must hold {expected}, got {part or 'neither'}")
 
 
+async def _record_frames(service: Service, requests: Any, context: Context) -> None:
+    service.life.require_serving()
+    first = await context.read()
+    if first is grpc.aio.EOF or first.WhichOneof("part") != "dataset":
+        raise InvalidArgument("the first message must name the recording", field="dataset")
+
+    async def receive() -> IncomingFrame | None:
+        if (message := await context.read()) is grpc.aio.EOF:
+            return None
+        frame = message.frame
+        return IncomingFrame(
+            pose=read_pose(frame.pose, "pose"),
+            image=frame.image,
+            number=frame.number if frame.HasField("number") else None,
+            time_s=frame.time_s if frame.HasField("time_s") else None,
+        )
+
+    async def send(answer: RecordingAnswer) -> None:
+        await context.write(to_message(answer, recordings_pb2.RecordFramesResponse))
+
+    with service.limits.stream():
+        async with service.recordings.stream(first.dataset) as stream:
+            await record(stream, receive, send, service.life.draining)
+
+
 async def _download_artifact(service: Service, request: Any, context: Context) -> None:
     found = await service.jobs.do(JobStore.artifact, request.job, request.name)
     length, offset = found.stored.bytes, request.offset
@@ -247,6 +296,7 @@ async def _watch_job(service: Service, request: Any, context: Context) -> None:
 
 STREAMS: Mapping[str, Stream] = {
     "DatasetService.UploadDataset": _upload_dataset,
+    "RecordingService.RecordFrames": _record_frames,
     "JobService.DownloadArtifact": _download_artifact,
     "JobService.WatchJob": _watch_job,
 }

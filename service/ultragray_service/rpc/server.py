@@ -18,6 +18,7 @@ from ultragray_proto.v1 import (
     access_pb2,
     datasets_pb2,
     jobs_pb2,
+    recordings_pb2,
     registrations_pb2,
     rendering_pb2,
     scenes_pb2,
@@ -37,7 +38,7 @@ LEAST_PING_INTERVAL_MS = 10_000
 MAX_CALLS_PER_CONNECTION = 1024
 _UNLIMITED = -1
 
-_FILES = (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2)
+_FILES = (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2, recordings_pb2)
 _DESCRIPTORS = {name: one for file in _FILES for name, one in file.DESCRIPTOR.services_by_name.items()}
 SERVICE_NAMES = tuple(one.full_name for one in _DESCRIPTORS.values())
 
@@ -112,6 +113,7 @@ class GrpcServer:
             "RenderService": parts.frames.ready,
             "SceneService": parts.frames.ready,
             "DatasetService": parts.artifacts.ready,
+            "RecordingService": parts.artifacts.ready,
             "JobService": parts.jobs.ready and parts.artifacts.ready,
             "WorkerService": parts.jobs.ready,
             "AccessService": True,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from ultragray.files import file_sha256, sync
+from ultragray_workers.datasets.recording import BLOCKS, RECORDINGS
 from ultragray_workers.datasets.store import FILES, MANIFESTS
 from ultragray_workers.jobs.files import FOLDER as JOBS
 from ultragray_workers.scene_names import SUFFIXES
@@ -68,7 +69,8 @@ def _files(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
         scenes = folders.root(root) / below
         names = [f"{name}{suffix}" for name in SceneStore(scenes).names() for suffix in SUFFIXES]
         yield from (StoredFile(root, below / name, scenes / name) for name in names if (scenes / name).is_file())
-    for folder in (FILES, MANIFESTS, JOBS):  # a dataset's files are there before its manifest
+    # The files of a dataset are there before its manifest, and a recording is there before its blocks.
+    for folder in (RECORDINGS, BLOCKS, FILES, MANIFESTS, JOBS):
         kept = _below(artifacts, PurePosixPath(folder))
         yield from (file for file in kept if not any(map(_is_of_a_process, file.path.parts[1:])))
     for entry in _entries(artifacts):  # facts about the folder itself

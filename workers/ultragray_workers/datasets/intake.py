@@ -15,10 +15,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO
 
+from ultragray.datasets.released import write_released
 from ultragray.datasets.source import find_source, load_dataset, options_of
 from ultragray.errors import DatasetInvalid, UltragrayError
 from ultragray.files import sync
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
+from ultragray_workers.datasets.recording import Recordings, recorded_dataset
 from ultragray_workers.datasets.store import (
     CONTACT_SHEET_NAME,
     FILES_NAME,
@@ -27,6 +29,7 @@ from ultragray_workers.datasets.store import (
     write_manifest,
 )
 from ultragray_workers.datasets.unpack import FileBudget, create_below, unpack
+from ultragray_workers.storage.location import open_storage
 
 PREFIX = ".incoming-"
 ARCHIVE_NAME, DATASET_NAME = "archive", "dataset"
@@ -121,10 +124,19 @@ def remove_stale(store: DatasetStore) -> int:
     return remove_abandoned(store.folder, PREFIX)
 
 
-def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int, *, simulated: bool = False) -> None:
+def take_in(
+    folder: str,
+    name: str,
+    options: dict[str, str],
+    max_bytes: int,
+    *,
+    simulated: bool = False,
+    recorded: str | None = None,
+) -> None:
     """Complete the dataset in the folder of an IncomingDataset: unpacked, checked, with contact sheet and manifest.
 
-    `simulated`: it holds nothing, and gets the built-in phantom.
+    `simulated`: it holds nothing, and gets the built-in phantom; `recorded`: the frames of the recording of its name,
+    in the storage at that location.
     Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, UploadTooLarge, StorageFull.
     """
     incoming = Path(folder).resolve()
@@ -137,7 +149,12 @@ def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int, *, 
             archive.unlink()
         if simulated:
             _simulate(files, max_bytes)
+        remarks: tuple[str, ...] = ()
+        if recorded is not None:
+            dataset, remarks = recorded_dataset(Recordings(open_storage(recorded)), name)
+            write_released(dataset, files)
         record = check_files(files, name, options, dataset_folder / CONTACT_SHEET_NAME)
+        record = replace(record, warnings=(*record.warnings, *remarks))
         for path in (*(path for path in files.rglob("*") if path.is_dir()), files):
             sync(path)
         write_manifest(record, dataset_folder)
@@ -145,7 +162,6 @@ def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int, *, 
 
 def _simulate(files: Path, max_bytes: int) -> None:
     """Writes the built-in phantom. Raises UploadTooLarge."""
-    from ultragray.datasets.released import write_released
     from ultragray.phantom import load_phantom
 
     write_released(load_phantom(), files)

@@ -5,7 +5,8 @@ An upload arrives and is checked in `datasets.intake`, and becomes a data set he
 datasets/NAME.json             the manifest, with the files of the data set: there is one as long as there is this
 dataset-files/UPLOAD/PATH      the files of one upload, there before its manifest and gone after it
 
-A data set appears and goes whole, by one conditional write of its manifest. Free of torch.
+A data set appears and goes whole, by one conditional write of its manifest. One that is still open is a recording, see
+`datasets.recording`, and has its name already. Free of torch.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files import file_sha256, require_version, write_whole
 from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import ImageRegion
+from ultragray_workers.datasets.recording import BLOCKS, Recordings
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, StorageUnavailable, known_names
 from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.local import LocalStorage
@@ -125,6 +127,7 @@ class DatasetStore:
         """
         self.folder = Path(artifact_folder) / UPLOADS  # in which uploads to this host arrive
         self.storage = storage or LocalStorage(Path(artifact_folder))
+        self.recordings = Recordings(self.storage)
         self.hides = hides
         self._max_copies_bytes = max_copies_bytes
         self._known: dict[str, tuple[str, str]] = {}  # version and manifest, by name
@@ -156,6 +159,10 @@ class DatasetStore:
         self._require_shown(name)
         return self._read(name)
 
+    def bytes_of(self, name: str) -> int:
+        """Of a data set, or of a recording that becomes one. Raises DatasetNotFound, DatasetInvalid."""
+        return self.recordings.state(name).bytes if self.recordings.is_open(name) else self.get(name).bytes
+
     def load(self, name: str) -> Dataset:
         """Read a data set as it was when it was accepted. Raises DatasetNotFound, DatasetInvalid."""
         record = self.get(name)
@@ -170,8 +177,14 @@ class DatasetStore:
             raise self._not_found(name) from None
 
     def is_taken(self, name: str) -> bool:
-        """Whether there is a data set of that name, hidden or not."""
-        return self.manifest(name) is not None
+        """Whether there is a data set of that name, or a recording that becomes one, hidden or not."""
+        return self.manifest(name) is not None or self.recordings.is_open(name)
+
+    def require(self, name: str) -> None:
+        """Raises DatasetNotFound unless there is a data set of that name, or a recording that becomes one."""
+        self._require_shown(name)
+        if not self.is_taken(name):
+            raise self._not_found(name)
 
     def manifest(self, name: str) -> str | None:
         """The manifest of a data set; None where there is none of that name."""
@@ -226,6 +239,8 @@ class DatasetStore:
 
     def held(self, name: str, sha256: str | None, options: dict[str, str]) -> DatasetRecord:
         """The data set `name`, where it has that content and those options. Raises DatasetExists for another."""
+        if self.recordings.is_open(name):
+            raise DatasetExists(f"the name {name!r} is that of a recording: choose another one", field="dataset")
         present = self._read(name)
         if (present.sha256, present.options) == (sha256, options) and not self.hides(name):
             return present
@@ -274,18 +289,28 @@ class DatasetStore:
             self._remove_files(StoredFiles.of(manifest))
 
     def remove_stray_files(self) -> int:
-        """Removes the files of uploads that no manifest names and that are a day old; how many there were."""
-        old: dict[str, list[Entry]] = {}
-        for entry in self.storage.entries(FILES):
-            if time.time() - entry.modified > _STRAY_AFTER_S:
-                old.setdefault(entry.key.split("/")[1], []).append(entry)
+        """Removes the files of uploads and recordings that nothing names and that are a day old; how many there were.
+
+        Those of a recording that has become a data set are gone with it, unless its service died in between.
+        """
+        return self._remove_strays(FILES, self._uploads) + self._remove_strays(BLOCKS, self.recordings.ids)
+
+    def _uploads(self) -> set[str]:
         named = set()
-        for name in self.names() if old else ():
+        for name in self.names():
             with contextlib.suppress(DatasetInvalid, DatasetNotFound):
                 named.add(self._files_of(name).upload)
-        strays = {upload: entries for upload, entries in old.items() if upload not in named}
+        return named
+
+    def _remove_strays(self, prefix: str, named: Callable[[], set[str]]) -> int:
+        old: dict[str, list[Entry]] = {}
+        for entry in self.storage.entries(prefix):
+            if time.time() - entry.modified > _STRAY_AFTER_S:
+                old.setdefault(entry.key.split("/")[1], []).append(entry)
+        known = named() if old else set()
+        strays = {upload: entries for upload, entries in old.items() if upload not in known}
         for upload in strays:
-            self.storage.delete_all(f"{FILES}/{upload}")
+            self.storage.delete_all(f"{prefix}/{upload}")
         return sum(map(len, strays.values()))
 
     def _read(self, name: str) -> DatasetRecord:

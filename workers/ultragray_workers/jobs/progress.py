@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from ultragray.contract import described
 
 _T = TypeVar("_T")
-PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")
+PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report", "live")
 
 
 class JobState(str, Enum):
@@ -59,7 +59,8 @@ class Progress:
     methods: int | None = None
     phase: str | None = described(
         "Of a training that runs: classical methods are measured, the effort is chosen, it trains, it is measured on "
-        "the held-out frames, its confidence is fitted, or its report is written.",
+        "the held-out frames, its confidence is fitted, or its report is written. Of a live job also: it follows the "
+        "recording.",
         None,
         choices=PHASES,
     )

@@ -23,6 +23,7 @@ from sqlalchemy.exc import IntegrityError
 
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.demand import Demand, demand_of_key
+from ultragray_workers.jobs.kinds.base import Specification
 from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
 from ultragray_workers.jobs.progress import Files, JobState, Outcome, Progress
 from ultragray_workers.jobs.record import COLUMNS, Row
@@ -163,7 +164,7 @@ def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool
         if not connection.execute(sa.update(JOBS).where(*_holds(held)).values(ended)).rowcount:
             return False
         if outcome.error is not None:
-            _give_name_back(connection, held.id, held.makes_scene, held.owner)
+            _give_name_back(connection, held)
     return True
 
 
@@ -173,15 +174,18 @@ def cancel(engine: sa.Engine, job_id: str) -> bool:
     ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
     changed = sa.update(JOBS).where(is_asked, _IS_UNFINISHED, JOBS.c.published.is_(False)).values(ended)
     with engine.begin() as connection:
-        cancelled = connection.execute(changed.returning(JOBS.c.id, JOBS.c.makes_scene, JOBS.c.owner)).all()
+        cancelled = connection.execute(
+            changed.returning(JOBS.c.id, JOBS.c.kind, JOBS.c.makes_scene, JOBS.c.owner)
+        ).all()
         for row in cancelled:
-            _give_name_back(connection, row.id, row.makes_scene, row.owner)
+            _give_name_back(connection, row)
     return any(row.id == job_id for row in cancelled)
 
 
-def _give_name_back(connection: sa.Connection, job_id: str, scene: str | None, owner: str | None) -> None:
-    if scene is not None:
-        forget_owner(connection, Kind.SCENE, scene, Ownership(owner, claim=claim_of_job(job_id)))
+def _give_name_back(connection: sa.Connection, job: Any) -> None:
+    """Frees the name of the scene that a job was to make; one that it serves already stays its owner's."""
+    if job.makes_scene is not None and not Specification.member(job.kind).serves_versions:
+        forget_owner(connection, Kind.SCENE, job.makes_scene, Ownership(job.owner, claim=claim_of_job(job.id)))
 
 
 def cancel_shares(engine: sa.Engine, batch: str) -> None:

@@ -222,6 +222,11 @@ class JobStore:
                     return
                 ownership = Ownership(owner, is_private, claim_of_job(job_id))
                 if not add_owner(connection, Kind.SCENE, made, ownership):
+                    holder = read_owner(connection, Kind.SCENE, made)
+                    if retry_of is not None and holder == replace(ownership, claim=claim_of_job(retry_of)):
+                        forget_owner(connection, Kind.SCENE, made, holder)
+                        add_owner(connection, Kind.SCENE, made, ownership)
+                        return
                     raise SceneExists(
                         f"a scene {made!r} is being imported: choose another name",
                         field=specification.makes_scene,
@@ -239,7 +244,7 @@ class JobStore:
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
                 if (dataset := _named(placed, placed.needs_dataset)) is not None:
-                    self._datasets.get(dataset)
+                    self._require_dataset(placed, dataset)
                 self._are_private(used, owner, by)
             except (DatasetNotFound, SceneNotFound):
                 queue.cancel(self._engine, job_id)
@@ -267,10 +272,11 @@ class JobStore:
         """
         taken = []
         if (dataset := _named(specification, specification.needs_dataset)) is not None:
-            self._datasets.get(dataset)
+            self._require_dataset(specification, dataset)
             taken.append((Kind.DATASET, dataset))
         made = _named(specification, specification.makes_scene)
-        if made is not None and made in self._scenes.names():
+        goes_on = before is not None and specification.serves_versions  # with the scene that it has served already
+        if made is not None and not goes_on and made in self._scenes.names():
             raise SceneExists(
                 f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
             )
@@ -289,6 +295,13 @@ class JobStore:
                     self._scenes.path(name)  # raises SceneNotFound where the scene has just gone
                     raise
         return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
+
+    def _require_dataset(self, specification: Specification, dataset: str) -> None:
+        """Raises DatasetNotFound, DatasetInvalid."""
+        if specification.takes_recordings:
+            self._datasets.require(dataset)
+        else:
+            self._datasets.get(dataset)
 
     def _are_private(self, used: list[tuple[Kind, str]], owner: str | None, by: str | None) -> bool:
         """Whether any of the datasets and scenes that a job takes is private.

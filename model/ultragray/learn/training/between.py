@@ -263,10 +263,17 @@ class Views(NamedTuple):
 class ViewsBetween:
     """Draws views with their expected images."""
 
-    def __init__(self, sweep: Sweep, neighbours: Neighbours, images: Tensor) -> None:  # [F, H, W] uint8
-        """`images` are those of the sweep, on the device of the training."""
+    def __init__(
+        self,
+        sweep: Sweep,
+        neighbours: Neighbours,
+        images: Tensor,  # [F, H, W] uint8
+        *,
+        follow_probe: bool | None = None,
+    ) -> None:
+        """`images` are those of the sweep, on the device of the training; `follow_probe`: None: the sweep tells."""
         self._sweep, self._neighbours, self._images = sweep, neighbours, images
-        self.follow_probe = features_follow_probe(sweep, neighbours)
+        self.follow_probe = features_follow_probe(sweep, neighbours) if follow_probe is None else follow_probe
 
     def draw(self, count: int, generator: torch.Generator) -> Views:
         """`count` views at places drawn by `draw_places`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -268,6 +269,12 @@ class Shadows:
         self._usual = _usual_by_depth(some)  # [H] brightness
         (self._bright_rows,) = np.nonzero(self._usual > LEAST_USUAL)
         self._usual_below = _usual_by_depth(self._brightest_below(self._relative(some)))  # [H]
+
+    def seen_in(self, sweep: Sweep) -> Shadows:
+        """The evidence in other frames of the same recording, by what is usual in those looked at."""
+        other = copy(self)
+        other._sweep = sweep
+        return other
 
     def of(self, place: int) -> Beam:
         height, width = self._sweep.height, self._sweep.width

@@ -150,13 +150,18 @@ class Optimizer:
             )
         return penalty
 
-    def replace(self, parameters: Mapping[str, Tensor], origin: Tensor) -> None:
-        """Goes on with new tensors: row i was row `origin[i]` of the old, or is a new Gaussian where that is −1."""
+    def replace(self, parameters: Mapping[str, Tensor], origin: Tensor, *, like_others: bool = False) -> None:
+        """Goes on with new tensors: row i was row `origin[i]` of the old, or is a new Gaussian where that is −1.
+
+        The moments of a new one are 0, which late in a run makes its first steps many times as long as those of others:
+        what corrects young moments counts the steps of the run. `like_others`: its second moment is their mean.
+        """
         self._trained = {name: parameters[name] for name in self._trained}
         for state in self._state.values():
             for moment in MOMENTS:
                 moved = state[moment][origin.clamp(min=0)]
-                moved[origin < 0] = 0.0
+                is_second = moment == MOMENTS[1]
+                moved[origin < 0] = state[moment].mean(dim=0) if like_others and is_second else 0.0
                 state[moment] = moved
 
     def tensors(self) -> dict[str, Tensor]:

@@ -137,10 +137,10 @@ async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") 
         transport = _WebSocketTransport(websocket, scene)
         await FrameStream(service.rendering, transport, (scene, RenderSettings()), record).run()
 
-    await _serve(websocket, _ROUTE, enter, answer)
+    await serve_websocket(websocket, _ROUTE, enter, answer)
 
 
-async def _serve(
+async def serve_websocket(
     websocket: WebSocket, route: str, enter: Callable[[ExitStack], Awaitable[T]], answer: Callable[[T], Awaitable[None]]
 ) -> None:
     """Answers a WebSocket that `enter` lets in; what that enters lasts as long. Counts it at its end."""
@@ -317,7 +317,7 @@ async def watch(websocket: WebSocket, stream: str) -> None:
         place.enter_context(service.limits.stream())
         return place.enter_context(service.streams.get(stream).watched())
 
-    await _serve(websocket, _STREAMS_ROUTE, enter, partial(_show, service, websocket))
+    await serve_websocket(websocket, _STREAMS_ROUTE, enter, partial(_show, service, websocket))
 
 
 async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> None:

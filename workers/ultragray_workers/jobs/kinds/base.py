@@ -76,10 +76,12 @@ class Specification(Family):
     # Its `run(job_run, specification)` does the work; None: that of an entry point of PLUGINS does.
     run_module: ClassVar[str | None] = None
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
+    takes_recordings: ClassVar[bool] = False  # also a recording, which is no dataset yet
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
     has_checkpoints: ClassVar[bool] = False  # interrupted, it goes on from where it was; others begin anew
     makes_scene: ClassVar[str | None] = None  # field: the scene among the artifacts is served when the job succeeds
+    serves_versions: ClassVar[bool] = False  # it serves that scene while it runs, too, and keeps it whatever ends it
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ultragray.files import write_whole
 from ultragray.learn.evaluation.baselines import IN_TIME, affordable_voxel_mm, evaluate_baselines
-from ultragray.learn.evaluation.scoring import evaluate_frames
+from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames
 from ultragray.learn.evaluation.side_by_side import write_spread
 from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
 from ultragray.learn.report.plots import write_training_curve
@@ -107,8 +107,11 @@ def _scoring_s(dataset: Dataset) -> float:
     return time.perf_counter() - started
 
 
-def run(job_run: JobRun, job: TrainJob) -> Outcome:
+def run(job_run: JobRun, job: TrainJob, *, better: GaussianScene | None = None, by_db: float = 0.0) -> Outcome:
     """Trains, or goes on from the checkpoint that an earlier process left, and completes the artifacts.
+
+    `better`: another scene of the same frames, which takes the place of the trained one where it shows the held-out
+    frames better `by_db` or more.
 
     Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.learn.training.train` raises.
     """
@@ -137,7 +140,26 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     )
     if scene.info.training["step"] < scene.info.training["steps"]:
         raise Stopped
+    if better is not None and len(dataset.val):
+        scene = _better(scene, better, dataset, by_db)
     return _finish(job_run, job, dataset, scene, device, finishing)
+
+
+def _better(scene: GaussianScene, other: GaussianScene, dataset: Dataset, by_db: float) -> GaussianScene:
+    measured = evaluate(other, dataset.val).mean
+    if measured.psnr_db < scene.info.metrics["psnr_db"] + by_db:
+        return scene
+    sys.stderr.write(f"the scene that was served before is better, {measured.psnr_db:.2f} dB: it stays\n")
+    trained = scene.info
+    other.info = replace(
+        other.info,
+        metrics=measured.to_dict(),
+        confidence=trained.confidence,
+        speckle=trained.speckle,
+        training={**other.info.training, "steps": other.info.training["step"]},
+        dataset_sha256=trained.dataset_sha256,
+    )
+    return other
 
 
 def _report(job_run: JobRun, state: TrainingProgress, finishing: Finishing) -> None:

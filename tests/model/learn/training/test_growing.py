@@ -1,0 +1,141 @@
+"""A scene that grows while its sweep arrives, on frames of the built-in phantom."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray.errors import DatasetInvalid
+from ultragray.learn.evaluation.baselines import evaluate_baselines
+from ultragray.learn.sweep import Dataset, Sweep, split_sequence
+from ultragray.learn.training import growing
+from ultragray.learn.training.growing import GrowingTrainer, Judgement
+from ultragray.learn.training.optimizer import Optimizer
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses
+from ultragray.phantom.imaging import simulate
+from ultragray.scene.confidence import Assessor
+
+SIDE, COUNT = 48, 24
+
+
+@pytest.fixture(scope="module")
+def sweep():
+    poses = freehand_poses(91)[30 : 30 + COUNT]
+    images = simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
+    return Sweep(images, poses, PHANTOM_PROBE, np.arange(COUNT), "phantom")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def grown(sweep, until=COUNT, steps=3):
+    trainer = GrowingTrainer("phantom", PHANTOM_PROBE)
+    for place in range(until):
+        trainer.add(sweep.images[place : place + 1], sweep.poses[place : place + 1])
+        for _ in range(steps if trainer.is_growing else 0):
+            trainer.take_step()
+    return trainer
+
+
+def all_psnr_db(trainer, monkeypatch):
+    monkeypatch.setattr(growing, "JUDGES", COUNT)
+    return trainer.judge().mean_psnr_db
+
+
+def test_it_shows_frames_that_it_never_saw_as_well_as_their_neighbours_do(sweep, monkeypatch):
+    train, val = split_sequence(sweep, COUNT, None, None)
+    linear = evaluate_baselines(Dataset("phantom", train, val), ("linear",), 1.0)["linear"].mean.psnr_db
+    trainer = grown(sweep)
+    for step in range(30):
+        trainer.take_step(0.1 ** (step / 30))
+    assert all_psnr_db(trainer, monkeypatch) > linear
+
+
+def test_gaussians_begin_with_each_frame_before_any_step_on_it(sweep):
+    trainer = grown(sweep, until=COUNT - 5)
+    before = trainer.gaussian_count
+    trainer.add(sweep.images[-5:], sweep.poses[-5:])
+    assert trainer.gaussian_count > before
+    judgement = trainer.judge()
+    assert min(judgement.psnr_db.values()) > 12.0  # black frames have less
+
+
+def test_a_probe_that_stands_still_adds_no_gaussians(sweep):
+    trainer = grown(sweep)
+    before = trainer.gaussian_count
+    for _ in range(3):
+        trainer.add(sweep.images[-1:], sweep.poses[-1:])
+    assert trainer.gaussian_count == before
+    trainer.take_step()
+
+
+def test_the_same_frames_and_steps_give_the_same_scene(sweep):
+    one, other = (grown(sweep, until=12).scene(Judgement({}, {})) for _ in range(2))
+    for name, tensor in one.splats.items():
+        assert torch.equal(tensor, other.splats[name]), name
+
+
+def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_been_killed(sweep, tmp_path):
+    def end(trainer):
+        trainer.add(sweep.images[16:20], sweep.poses[16:20])
+        for _ in range(4):
+            trainer.take_step()
+        return trainer.judge().mean_psnr_db
+
+    trainer = grown(sweep, until=16)
+    trainer.accept(trainer.judge())
+    trainer.save(tmp_path / "checkpoint")
+    count = GrowingTrainer.frames_of(tmp_path / "checkpoint")
+    again = GrowingTrainer("phantom", PHANTOM_PROBE)
+    again.restore(tmp_path / "checkpoint", sweep.images[:count], sweep.poses[:count])
+    assert (count, again.step, again.gaussian_count) == (16, trainer.step, trainer.gaussian_count)
+    assert end(again) == pytest.approx(end(trainer), abs=0.3)
+
+
+def test_a_version_that_shows_the_same_frames_worse_is_told_from_one_that_does_not(sweep):
+    trainer = grown(sweep, until=12)
+    trainer.accept(trainer.judge())
+    assert not trainer.is_worse(trainer.judge())
+    with torch.no_grad():
+        trainer._parameters["sh0"] += 1.0
+    assert trainer.is_worse(trainer.judge())
+
+
+def test_a_version_tells_where_it_holds(sweep):
+    trainer = grown(sweep)
+    scene = trainer.scene(trainer.judge())
+    away = sweep.poses[COUNT // 2].copy()
+    away[1, 3] += 25.0
+    inside, outside = Assessor(scene.info, scene.training_poses).assess(np.stack([sweep.poses[COUNT // 2], away]))
+    assert outside.confidence < inside.confidence
+
+
+def test_frames_too_small_to_compare_are_refused(sweep):
+    with pytest.raises(DatasetInvalid, match="11 rows"):
+        GrowingTrainer("tiny", PHANTOM_PROBE).add(sweep.images[:1, :8, :8], sweep.poses[:1])
+
+
+def test_a_late_gaussian_takes_steps_as_long_as_those_of_others():
+    def optimizer(rows):
+        parameters = {"means": torch.zeros(rows, 3, requires_grad=True)}
+        return parameters, Optimizer(parameters, batch_size=8)
+
+    def step(parameters, adam):
+        parameters["means"].grad = torch.ones_like(parameters["means"])
+        before = parameters["means"].detach().clone()
+        adam.step({"means": 1.0})
+        return (parameters["means"].detach() - before).abs()
+
+    parameters, adam = optimizer(1)
+    for _ in range(50):
+        step(parameters, adam)
+    joined = {"means": torch.zeros(2, 3, requires_grad=True)}
+    adam.replace(joined, torch.tensor([0, -1]), like_others=True)
+    old, new = step(joined, adam)
+    assert float(new.max()) <= 1.01 * float(old.max())

@@ -1,0 +1,127 @@
+"""Recordings: frames that are added one after another, durable, by one writer at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidImageSize
+from ultragray.rendering.pixels import png_file
+from ultragray_workers.datasets.recording import (
+    RecordedFrame,
+    Recordings,
+    RecordingSettings,
+    recorded_dataset,
+)
+from ultragray_workers.errors import DatasetExists, DatasetNotFound, RecordingTaken, UploadTooLarge
+from ultragray_workers.storage.local import LocalStorage
+
+SETTINGS = RecordingSettings(LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0), 16, 12)
+
+
+def frames(*numbers, time_s=0.1):
+    made = []
+    for number in numbers:
+        pose = np.eye(4)
+        pose[1, 3] = 0.5 * number
+        pixels = np.random.default_rng(number).integers(0, 255, (16, 12), np.uint8)
+        made.append(RecordedFrame(number, time_s * number, pose, pixels))
+    return made
+
+
+def numbers_in(recordings, name="liver"):
+    return [frame.number for block in recordings.frames(name) for frame in block]
+
+
+@pytest.fixture
+def recordings(tmp_path):
+    made = Recordings(LocalStorage(tmp_path))
+    made.begin("liver", SETTINGS)
+    return made
+
+
+def test_frames_come_back_as_they_were_added(recordings):
+    sent = frames(0, 1, 2)
+    writer = recordings.writer("liver")
+    writer.append(sent[:1])
+    state = writer.append(sent[1:])
+    found = [frame for block in recordings.frames("liver") for frame in block]
+    assert (state.frames, state.next_number, recordings.state("liver")) == (3, 3, state)
+    for one, other in zip(sent, found, strict=True):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
+        np.testing.assert_array_equal(one.pose, other.pose)
+        assert one.time_s == other.time_s
+
+
+def test_a_writer_goes_on_where_one_that_died_has_left_off(recordings):
+    recordings.writer("liver").append(frames(0, 1))
+    state = recordings.writer("liver").append(frames(1, 2))  # the sender did not learn that 1 was stored
+    assert (state.frames, numbers_in(recordings)) == (3, [0, 1, 2])
+
+
+def test_a_block_that_was_cut_off_goes_and_its_frames_are_sent_again(recordings, tmp_path):
+    writer = recordings.writer("liver")
+    writer.append(frames(0))
+    writer.append(frames(1, 2))
+    torn = max((tmp_path / "recording-blocks").rglob("0*"))
+    torn.write_bytes(torn.read_bytes()[:-5])
+    assert numbers_in(recordings) == [0]
+    again = recordings.writer("liver")
+    assert (again.state.frames, again.state.next_number) == (1, 1)
+    again.append(frames(1, 2))
+    assert numbers_in(recordings) == [0, 1, 2]
+
+
+def test_of_two_writers_the_second_is_refused(recordings):
+    first, second = recordings.writer("liver"), recordings.writer("liver")
+    first.append(frames(0))
+    with pytest.raises(RecordingTaken, match="liver"):
+        second.append(frames(0))
+    assert numbers_in(recordings) == [0]
+
+
+def test_no_more_bytes_are_stored_than_allowed(recordings):
+    writer = recordings.writer("liver")
+    with pytest.raises(UploadTooLarge):
+        writer.append(frames(0), max_bytes=100)
+    assert recordings.state("liver").bytes == 0
+
+
+def test_a_recording_is_begun_again_with_its_own_settings_alone(recordings):
+    recordings.begin("liver", SETTINGS)
+    with pytest.raises(DatasetExists):
+        recordings.begin("liver", RecordingSettings(SETTINGS.probe, 20, 12))
+
+
+def test_a_recording_that_was_deleted_is_not_found(recordings, tmp_path):
+    recordings.writer("liver").append(frames(0))
+    recordings.delete("liver")
+    with pytest.raises(DatasetNotFound):
+        recordings.state("liver")
+    assert not list((tmp_path / "recording-blocks").rglob("0*"))
+
+
+def test_a_dataset_holds_every_fifth_frame_out_and_tells_what_was_lost(recordings):
+    recordings.writer("liver").append([*frames(0, 1, 2, 3, 5, 6, 7), *frames(90)])
+    dataset, remarks = recorded_dataset(recordings, "liver")
+    assert (len(dataset.train), len(dataset.val)) == (6, 2)
+    assert "83 frames were lost" in remarks[0]
+    assert "paused 1 times" in remarks[1]
+
+
+def test_a_recording_without_frames_is_no_dataset(recordings):
+    with pytest.raises(DatasetInvalid):
+        recorded_dataset(recordings, "liver")
+
+
+def test_pixels_come_as_grey_values_or_as_a_png_file():
+    (frame,) = frames(0)
+    np.testing.assert_array_equal(SETTINGS.pixels(frame.pixels.tobytes()), frame.pixels)
+    np.testing.assert_array_equal(SETTINGS.pixels(png_file(frame.pixels)), frame.pixels)
+    with pytest.raises(InvalidImageSize, match="16x12"):
+        SETTINGS.pixels(png_file(frame.pixels[:8]))
+    with pytest.raises(InvalidArgument, match="constant"):
+        SETTINGS.pixels(bytes(16 * 12))
+    with pytest.raises(InvalidArgument, match="PNG"):
+        SETTINGS.pixels(b"nonsense")

@@ -1,0 +1,242 @@
+"""The work of a live job: it follows a recording, lets a scene grow, serves its versions, then trains as `fast` does.
+
+A process that is killed goes on from its last checkpoint, and reads the frames after it from the recording again.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.sweep import HELD_OUT_START, HELD_OUT_STEP, ByteArray, Dataset
+from ultragray.learn.training.growing import LOST_DB, GrowingTrainer
+from ultragray.learn.training.trainer import CHECKPOINT_FILE
+from ultragray.scene.gaussians import GaussianScene
+from ultragray_workers.datasets.store import DatasetStore, open_datasets
+from ultragray_workers.errors import DatasetNotFound, StorageUnavailable
+from ultragray_workers.jobs.kinds import train_run
+from ultragray_workers.jobs.kinds.live import LiveJob
+from ultragray_workers.jobs.kinds.train import TrainJob
+from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scene_names import SUFFIX
+from ultragray_workers.scene_shelf import SCENES_FOLDER, SceneShelf
+from ultragray_workers.storage.location import open_storage
+
+CHECKPOINT = "live.safetensors"  # of the folder of the run
+CHECKPOINT_EVERY_S = 5.0
+POLL_S = 0.1  # while nothing is to be done but to wait for frames
+LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
+SETTLE_S = 16.0  # after the last frame: steps that become ever smaller
+MOST_FRAMES = 32  # taken from the recording before the next step
+
+
+class Following:
+    """The frames of a recording in their order, as they come, and then those of the data set that it has become."""
+
+    def __init__(self, datasets: DatasetStore, name: str) -> None:
+        """Raises DatasetNotFound where there is neither."""
+        self._datasets, self._name = datasets, name
+        self.dataset: Dataset | None = None  # once the recording is finished
+        self._blocks = self._taken = 0
+        self._looked_at_s = float("-inf")
+        self.probe = self._begin()
+
+    def _begin(self) -> Probe:
+        try:
+            return self._datasets.recordings.settings(self._name).probe
+        except DatasetNotFound:
+            self._finish()
+            assert self.dataset is not None
+            return self.dataset.probe
+
+    def next(self, most: int = MOST_FRAMES) -> tuple[ByteArray, FloatArray] | None:  # [F, H, W], [F, 4, 4] mm
+        """Frames that have come since the last call, at most about so many; None where there are none.
+
+        Raises DatasetNotFound where the recording was deleted.
+        """
+        if self.dataset is not None:
+            return self._left(most)
+        now_s = time.monotonic()
+        if not self._datasets.storage.is_near and now_s - self._looked_at_s < LOOK_EVERY_S:
+            return None
+        self._looked_at_s = now_s
+        found = []
+        try:
+            for block in self._datasets.recordings.frames(self._name, self._blocks):
+                found += block
+                self._blocks += 1
+                if len(found) >= most:
+                    break
+        except DatasetNotFound:  # it has become a data set, or is gone
+            self._finish()
+            return self._left(most)
+        if not found:
+            return None
+        self._taken += len(found)
+        return np.stack([one.pixels for one in found]), np.stack([one.pose for one in found])
+
+    def _finish(self) -> None:
+        self.dataset = self._datasets.load(self._name)
+
+    def _left(self, most: int) -> tuple[ByteArray, FloatArray] | None:
+        assert self.dataset is not None
+        images, poses = in_recorded_order(self.dataset)
+        first, self._taken = self._taken, min(len(images), self._taken + most)
+        return (images[first : self._taken], poses[first : self._taken]) if first < self._taken else None
+
+
+def in_recorded_order(dataset: Dataset) -> tuple[ByteArray, FloatArray]:  # [F, H, W], [F, 4, 4] mm
+    """The frames that a data set was recorded as; of one that is split otherwise those to train from."""
+    train, val = dataset.train, dataset.val
+    held_out = np.arange(HELD_OUT_START, len(train) + len(val), HELD_OUT_STEP)
+    if len(held_out) != len(val):
+        return train.images, train.poses
+    others = np.setdiff1d(np.arange(len(train) + len(val)), held_out)
+    order = np.argsort(np.concatenate([others, held_out]))
+    return np.concatenate([train.images, val.images])[order], np.concatenate([train.poses, val.poses])[order]
+
+
+class _Live:
+    """One process at a live job, until the recording is finished and its scene has settled."""
+
+    def __init__(self, job_run: JobRun, job: LiveJob, datasets: DatasetStore) -> None:
+        self._run, self._job = job_run, job
+        self.following = Following(datasets, job.recording)
+        self._shelf = SceneShelf(open_storage(job_run.request.storage), SCENES_FOLDER)
+        self._checkpoint = job_run.folder.run / CHECKPOINT
+        self._file = job_run.folder.path / f"version{SUFFIX}"
+        self.trainer = GrowingTrainer(job.recording, self.following.probe, device=job_run.request.device)
+        self._saved_at_s = self._served_at_s = time.monotonic()
+        self._steps_at_last_frame = self._served_step = 0
+        self._steps_per_s = 0.0
+        self.scene: GaussianScene | None = None  # the version that is served
+        self._restore()
+
+    def follow(self) -> None:
+        """Learns until the last frame has come. Raises Stopped."""
+        while True:
+            frames = self._run.patiently(self.following.next, StorageUnavailable)
+            if frames is not None:
+                self.trainer.add(*frames)
+                self._steps_at_last_frame = self.trainer.step
+            elif self.following.dataset is not None:
+                return
+            rests = self.trainer.step - self._steps_at_last_frame >= self.trainer.steps_enough
+            if rests and frames is None:
+                time.sleep(POLL_S)
+            else:
+                self._take_step()
+            self._serve_now_and_then()
+            self._tell()
+
+    def settle(self) -> None:
+        """Takes steps that become ever smaller, for a while. Raises Stopped."""
+        if not self.trainer.is_growing:
+            return
+        begun_s = time.monotonic()
+        while (share := (time.monotonic() - begun_s) / SETTLE_S) < 1.0:
+            self._take_step(0.1**share)
+            self._serve_now_and_then()
+            self._tell()
+        self.serve()
+        self._save()
+
+    def serve(self) -> None:
+        """Serves the scene as it is, unless it has become worse."""
+        judgement = self.trainer.judge()
+        self._served_at_s, self._served_step = time.monotonic(), self.trainer.step
+        progress = self._run.progress
+        if self.trainer.is_worse(judgement):
+            sys.stderr.write(f"step {self.trainer.step:,}: not served, for the version before is better\n")
+            return
+        self.scene = self.trainer.scene(judgement)
+        self.publish(self.scene)
+        self.trainer.accept(judgement)
+        self._run.progress = replace(progress, val_psnr_db=judgement.mean_psnr_db)
+        held_out = "" if judgement.mean_psnr_db is None else f", held out {judgement.mean_psnr_db:.2f} dB"
+        sys.stderr.write(
+            f"step {self.trainer.step:,}, frame {self.trainer.frame_count:,}: a version of "
+            f"{self.trainer.gaussian_count:,} Gaussians is served{held_out}\n"
+        )
+        sys.stderr.flush()
+
+    def publish(self, scene: GaussianScene) -> None:
+        scene.save(self._file)
+        self._run.patiently(lambda: self._shelf.replace(self._file, self._job.scene), StorageUnavailable)
+        self._file.unlink()  # of a near storage it is a link to the scene
+
+    def _take_step(self, rate: float = 1.0) -> None:
+        if not self.trainer.is_growing:
+            time.sleep(POLL_S)
+            return
+        begun_s = time.monotonic()
+        self.trainer.take_step(rate)
+        taken_s = time.monotonic() - begun_s
+        self._steps_per_s = 0.9 * self._steps_per_s + 0.1 / max(taken_s, 1e-3) if self._steps_per_s else 1.0 / taken_s
+
+    def _serve_now_and_then(self) -> None:
+        now_s = time.monotonic()
+        if self.trainer.step > self._served_step and now_s - self._served_at_s >= self._job.version_every_s:
+            self.serve()
+        if self.trainer.is_growing and now_s - self._saved_at_s >= CHECKPOINT_EVERY_S:
+            self._save()
+
+    def _tell(self) -> None:
+        trainer, told = self.trainer, self._run.progress
+        self._run.report(
+            Progress(
+                phase="live",
+                step=trainer.step,
+                val_psnr_db=told.val_psnr_db,
+                gaussians=trainer.gaussian_count,
+                frames_done=trainer.frame_count,
+                rate_per_s=self._steps_per_s,
+            )
+        )
+        if self._run.should_stop():
+            if trainer.is_growing:
+                self._save()
+            raise Stopped
+
+    def _save(self) -> None:
+        self._checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        self.trainer.save(self._checkpoint)
+        self._saved_at_s = time.monotonic()
+
+    def _restore(self) -> None:
+        """Goes on from the checkpoint that an earlier process left. Raises TrainingStateInvalid."""
+        if not self._checkpoint.exists():
+            return
+        count = GrowingTrainer.frames_of(self._checkpoint)
+        parts: list[tuple[ByteArray, FloatArray]] = []
+        while (left := count - sum(len(images) for images, _ in parts)) > 0:
+            part = self._run.patiently(partial(self.following.next, left), StorageUnavailable)
+            if part is not None:
+                parts.append(part)
+        images, poses = (np.concatenate(some) for some in zip(*parts, strict=True))
+        self.trainer.restore(self._checkpoint, images, poses)
+        self._steps_at_last_frame = self.trainer.step
+        sys.stderr.write(f"going on from a checkpoint after step {self.trainer.step:,}, frame {count:,}\n")
+
+
+def run(job_run: JobRun, job: LiveJob) -> Outcome:
+    """Follows the recording to its end, then trains; the scene of the preset `fast` is served last, unless it is worse.
+
+    Raises Stopped, DatasetNotFound where the recording is deleted, and what a training raises.
+    """
+    request = job_run.request
+    datasets = open_datasets(job_run.folder.artifact_folder, request.storage, request.max_copies_bytes)
+    live = _Live(job_run, job, datasets)
+    live.follow()
+    if not (job_run.folder.run / CHECKPOINT_FILE).exists():
+        live.settle()
+    training = TrainJob(dataset=job.recording, scene=job.scene, device=job.device)
+    outcome = train_run.run(job_run, training, better=live.scene, by_db=LOST_DB)
+    live.publish(GaussianScene.load(job_run.folder.artifacts / f"{job.scene}{SUFFIX}"))
+    return outcome
