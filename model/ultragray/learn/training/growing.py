@@ -60,6 +60,7 @@ STILL = 0.25  # of the usual spacing: a frame nearer to one that is there alread
 RECENT_FRAMES = 16
 FLOOR_STEPS = 75  # of a Gaussian's first, in which what lies in a shadow keeps its floor
 JUDGES = 8  # held-out frames of a version, beside those that are new since the one before
+LEAST_CAUTION, REGAINED = 0.05, 1.1  # of the factor on all rates: its least, and what a version gives back of it
 LOST_DB = 0.2  # a version that shows the frames before it worse by so much is not shown
 
 
@@ -88,7 +89,9 @@ class GrowingTrainer:
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
-        self._judged: dict[int, float] = {}  # PSNR of the version that is shown, by held-out frame
+        self._judged: dict[int, float] = {}  # best PSNR of the versions shown, by held-out frame
+        self._shown: dict[str, Tensor] = {}  # its parameters, and those with which newer Gaussians began
+        self._caution = 1.0  # factor on all rates: less after a version that was worse
 
     @property
     def is_growing(self) -> bool:
@@ -98,11 +101,6 @@ class GrowingTrainer:
     @property
     def gaussian_count(self) -> int:
         return len(self._born)
-
-    @property
-    def steps_enough(self) -> int:
-        """The steps after which a sweep that goes no further is learned: those of `fast`."""
-        return (self._config.steps or 0) if self.is_growing else 0
 
     def add(self, images: ByteArray, poses: FloatArray) -> None:  # [F, H, W], [F, 4, 4] mm
         """Takes the next frames of the recording. Raises DatasetInvalid for such as a data set cannot have."""
@@ -143,7 +141,8 @@ class GrowingTrainer:
         loss = image + absorption_loss(frames["transmittance"], self._shadowed, sides, config.absorption_penalty)
         loss.backward()  # type: ignore[no-untyped-call]
         with torch.no_grad():
-            self._optimizer.step({name: rate * one for name, one in self._schedule.rates(0).items()})
+            rates = self._schedule.rates(0)
+            self._optimizer.step({name: self._caution * rate * one for name, one in rates.items()})
             held = torch.where(self.step - self._born < FLOOR_STEPS, self._floor, 0.0)
             least = least_sh0(held.to(self._device), config.intensity)
             project_sh0(self._parameters["sh0"], config.intensity, least)
@@ -186,13 +185,26 @@ class GrowingTrainer:
         return Judgement(psnr_db, ms_ssim)
 
     def is_worse(self, judgement: Judgement) -> bool:
-        """Whether the version that is shown shows the same frames better by more than LOST_DB."""
+        """Whether versions that were shown have shown the same frames better by more than LOST_DB."""
         lost = [self._judged[place] - now for place, now in judgement.psnr_db.items() if place in self._judged]
         return bool(lost) and float(np.mean(lost)) > LOST_DB
 
     def accept(self, judgement: Judgement) -> None:
         """Counts the version of this judgement as the one that is shown."""
-        self._judged.update(judgement.psnr_db)
+        for place, psnr_db in judgement.psnr_db.items():
+            self._judged[place] = max(psnr_db, self._judged.get(place, psnr_db))
+        self._shown = {name: tensor.detach().cpu().clone() for name, tensor in self._parameters.items()}
+        self._caution = min(1.0, REGAINED * self._caution)
+
+    def go_back(self) -> None:
+        """Goes back to the version that is shown, with the Gaussians that began since, and on in smaller steps.
+
+        Steps that are too large for frames with much noise would else keep newer frames from being shown.
+        """
+        if self._shown:
+            self._parameters = self._trainable({name: tensor.clone() for name, tensor in self._shown.items()})
+            self._begin_optimizer()
+        self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
 
     def save(self, path: Path) -> None:
         """Writes all that `restore` goes on from, beside the frames themselves."""
@@ -321,6 +333,9 @@ class GrowingTrainer:
         joined = {name: torch.cat([old[name], one]) if old else one for name, one in start.parameters.items()}
         origin = torch.cat([torch.arange(self.gaussian_count), torch.full((added,), -1)])
         order = spatial_order(joined["means"])
+        if self._shown:
+            begun = {name: torch.cat([self._shown[name], one]) for name, one in start.parameters.items()}
+            self._shown = {name: tensor[order] for name, tensor in begun.items()}
         self._born = torch.cat([self._born, torch.full((added,), self.step)])[order]
         self._floor = torch.cat([self._floor, start.floor])[order]
         self._parameters = self._trainable({name: tensor[order].contiguous() for name, tensor in joined.items()})

@@ -32,6 +32,7 @@ CHECKPOINT = "live.safetensors"  # of the folder of the run
 CHECKPOINT_EVERY_S = 5.0
 POLL_S = 0.1  # while nothing is to be done but to wait for frames
 LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
+PAUSE_STEPS = 150  # after which a sweep that goes no further is learned; they become ever smaller
 SETTLE_S = 16.0  # after the last frame: steps that become ever smaller
 MOST_FRAMES = 32  # taken from the recording before the next step
 
@@ -127,11 +128,11 @@ class _Live:
                 self._steps_at_last_frame = self.trainer.step
             elif self.following.dataset is not None:
                 return
-            rests = self.trainer.step - self._steps_at_last_frame >= self.trainer.steps_enough
-            if rests and frames is None:
+            since = self.trainer.step - self._steps_at_last_frame
+            if since >= PAUSE_STEPS and frames is None:
                 time.sleep(POLL_S)
             else:
-                self._take_step()
+                self._take_step(0.1 ** (since / PAUSE_STEPS))
             self._serve_now_and_then()
             self._tell()
 
@@ -154,6 +155,7 @@ class _Live:
         progress = self._run.progress
         if self.trainer.is_worse(judgement):
             sys.stderr.write(f"step {self.trainer.step:,}: not served, for the version before is better\n")
+            self.trainer.go_back()
             return
         self.scene = self.trainer.scene(judgement)
         self.publish(self.scene)
