@@ -209,6 +209,7 @@ def test_a_scene_grows_while_it_is_scanned_and_outlives_killed_workers(client, h
             list(client.recordings.record(begun, map(frame_of, numbers)))
             wait_until(lambda: version() not in (None, *seen) and frames_done() >= 10 * (sweep + 1))  # noqa: B023
             seen.append(version())
+            wait_until(lambda: list(artifacts.rglob("run/live.safetensors")))
             if sweep == 2:
                 worker.kill()
                 worker = RunningWorker(artifacts, None, "one", tmp_path / "worker.log", {})

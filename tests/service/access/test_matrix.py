@@ -13,6 +13,7 @@ from ultragray_proto.v1 import (
     access_pb2,
     datasets_pb2,
     jobs_pb2,
+    recordings_pb2,
     registrations_pb2,
     rendering_pb2,
     scenes_pb2,
@@ -30,7 +31,10 @@ from .conftest import ROLES
 STRANGERS = ("nobody", "wrong", "expired", "revoked")
 METHODS = {
     f"/{service.full_name}/{method.name}": method
-    for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2)
+    for module in (
+        *(scenes_pb2, rendering_pb2, datasets_pb2, recordings_pb2),
+        *(jobs_pb2, access_pb2, workers_pb2, registrations_pb2),
+    )
     for service in module.DESCRIPTOR.services_by_name.values()
     for method in service.methods
 }
@@ -112,6 +116,8 @@ def call(channel, name, things, metadata):
     method = METHODS[name]
     request, answers = GetMessageClass(method.input_type), GetMessageClass(method.output_type)
     given = {**things, "settings": rendering_pb2.RenderSettings(scene=things["scene"])}
+    if name.endswith("/BeginRecording"):
+        del given["settings"]  # its own: it goes on without
     request = request(**{field.name: given[field.name] for field in method.input_type.fields if field.name in given})
     kind = f"{'stream' if method.client_streaming else 'unary'}_{'stream' if method.server_streaming else 'unary'}"
     invoke = getattr(channel, kind)(name, type(request).SerializeToString, answers.FromString)

@@ -89,7 +89,7 @@ class GrowingTrainer:
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
-        self._judged: dict[int, float] = {}  # best PSNR of the versions shown, by held-out frame
+        self.judged: dict[int, float] = {}  # best PSNR of the versions shown, by held-out frame
         self._shown: dict[str, Tensor] = {}  # its parameters, and those with which newer Gaussians began
         self._caution = 1.0  # factor on all rates: less after a version that was worse
 
@@ -170,7 +170,7 @@ class GrowingTrainer:
         held_out = self._held_out
         if held_out is None or not len(held_out):
             return Judgement({}, {})
-        known = np.array(sorted(self._judged), np.int64)
+        known = np.array(sorted(self.judged), np.int64)
         newer = np.setdiff1d(np.arange(len(held_out)), known)
         chosen = np.concatenate([known[spread_places(len(known), JUDGES)], newer[spread_places(len(newer), JUDGES)]])
         psnr_db, ms_ssim = {}, {}
@@ -186,13 +186,13 @@ class GrowingTrainer:
 
     def is_worse(self, judgement: Judgement) -> bool:
         """Whether versions that were shown have shown the same frames better by more than LOST_DB."""
-        lost = [self._judged[place] - now for place, now in judgement.psnr_db.items() if place in self._judged]
+        lost = [self.judged[place] - now for place, now in judgement.psnr_db.items() if place in self.judged]
         return bool(lost) and float(np.mean(lost)) > LOST_DB
 
     def accept(self, judgement: Judgement) -> None:
         """Counts the version of this judgement as the one that is shown."""
         for place, psnr_db in judgement.psnr_db.items():
-            self._judged[place] = max(psnr_db, self._judged.get(place, psnr_db))
+            self.judged[place] = max(psnr_db, self.judged.get(place, psnr_db))
         self._shown = {name: tensor.detach().cpu().clone() for name, tensor in self._parameters.items()}
         self._caution = min(1.0, REGAINED * self._caution)
 
@@ -201,17 +201,16 @@ class GrowingTrainer:
 
         Steps that are too large for frames with much noise would else keep newer frames from being shown.
         """
-        if self._shown:
+        if self._shown:  # by this process
             self._parameters = self._trainable({name: tensor.clone() for name, tensor in self._shown.items()})
             self._begin_optimizer()
-        self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
+            self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
 
     def save(self, path: Path) -> None:
         """Writes all that `restore` goes on from, beside the frames themselves."""
         state = {f"parameter.{name}": tensor for name, tensor in self._parameters.items()}
         state |= {f"adam.{name}": tensor for name, tensor in self._optimizer.tensors().items()}
-        judged = torch.tensor(sorted(self._judged.items()), dtype=torch.float64).reshape(-1, 2)
-        state |= {"born": self._born, "floor": self._floor, "judged": judged}
+        state |= {"born": self._born, "floor": self._floor}
         state |= {"frames": torch.tensor(self.frame_count), "centre_mm": torch.from_numpy(self._centre_mm)}
         state["generator"] = self._generator.get_state()
         count, steps = self.gaussian_count, max(1, self.step)
@@ -238,7 +237,6 @@ class GrowingTrainer:
         self._begin_optimizer()
         self._optimizer.load({name.removeprefix("adam."): t for name, t in tensors.items() if name.startswith("adam.")})
         self._generator.set_state(tensors["generator"])
-        self._judged = {int(place): float(psnr_db) for place, psnr_db in tensors["judged"].tolist()}
         self._look_between(train)
 
     def _keep(self, images: ByteArray, poses: FloatArray) -> None:

@@ -96,6 +96,7 @@ def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_been_killed(sweep, tmp_pa
     trainer.save(tmp_path / "checkpoint")
     count = GrowingTrainer.frames_of(tmp_path / "checkpoint")
     again = GrowingTrainer("phantom", PHANTOM_PROBE)
+    again.judged = dict(trainer.judged)
     again.restore(tmp_path / "checkpoint", sweep.images[:count], sweep.poses[:count])
     assert (count, again.step, again.gaussian_count) == (16, trainer.step, trainer.gaussian_count)
     assert end(again) == pytest.approx(end(trainer), abs=0.3)

@@ -5,6 +5,7 @@ A process that is killed goes on from its last checkpoint, and reads the frames 
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from dataclasses import replace
@@ -12,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import HELD_OUT_START, HELD_OUT_STEP, ByteArray, Dataset
 from ultragray.learn.training.growing import LOST_DB, GrowingTrainer
@@ -28,7 +30,7 @@ from ultragray_workers.scene_names import SUFFIX
 from ultragray_workers.scene_shelf import SCENES_FOLDER, SceneShelf
 from ultragray_workers.storage.location import open_storage
 
-CHECKPOINT = "live.safetensors"  # of the folder of the run
+CHECKPOINT, JUDGED = "live.safetensors", "judged.json"  # of the folder of the run: the latter of what is served
 CHECKPOINT_EVERY_S = 5.0
 POLL_S = 0.1  # while nothing is to be done but to wait for frames
 LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
@@ -111,6 +113,7 @@ class _Live:
         self.following = Following(datasets, job.recording)
         self._shelf = SceneShelf(open_storage(job_run.request.storage), SCENES_FOLDER)
         self._checkpoint = job_run.folder.run / CHECKPOINT
+        self._judged = job_run.folder.run / JUDGED
         self._file = job_run.folder.path / f"version{SUFFIX}"
         self.trainer = GrowingTrainer(job.recording, self.following.probe, device=job_run.request.device)
         self._saved_at_s = self._served_at_s = time.monotonic()
@@ -160,6 +163,8 @@ class _Live:
         self.scene = self.trainer.scene(judgement)
         self.publish(self.scene)
         self.trainer.accept(judgement)
+        self._judged.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(self._judged, json.dumps(self.trainer.judged))
         self._run.progress = replace(progress, val_psnr_db=judgement.mean_psnr_db)
         held_out = "" if judgement.mean_psnr_db is None else f", held out {judgement.mean_psnr_db:.2f} dB"
         sys.stderr.write(
@@ -213,6 +218,8 @@ class _Live:
 
     def _restore(self) -> None:
         """Goes on from the checkpoint that an earlier process left. Raises TrainingStateInvalid."""
+        if self._judged.exists():  # no version is served that is worse than those before, whatever was lost with them
+            self.trainer.judged = {int(place): of for place, of in json.loads(self._judged.read_text()).items()}
         if not self._checkpoint.exists():
             return
         count = GrowingTrainer.frames_of(self._checkpoint)
