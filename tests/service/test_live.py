@@ -96,7 +96,7 @@ def test_frames_are_posted_one_by_one_and_become_a_dataset(http, begun):
 @pytest.mark.parametrize(
     ("body", "reason", "field"),
     [
-        (b"\1\0", "INVALID_ARGUMENT", "body"),
+        (b"\1\0", "INVALID_ARGUMENT", None),
         (message_of(0, image=b"\0" * 7), "INVALID_ARGUMENT", "image"),
         (message_of(0, image=bytes(SIDE * SIDE)), "INVALID_ARGUMENT", "image"),
         (message_of(0, pose=np.zeros((4, 4))), "INVALID_POSE", "pose.matrix"),

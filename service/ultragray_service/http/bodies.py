@@ -35,7 +35,7 @@ from ultragray_service.core.editing import EditTarget
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.recordings import MAX_NUMBER, IncomingFrame
-from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
+from ultragray_service.core.streams import MAX_POSE_BYTES, MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
 from ultragray_service.http.dependencies import require_uncompressed
 from ultragray_service.http.problems import invalid_argument
@@ -414,7 +414,19 @@ class StreamMessage(Contract):
     )
 
 
-_HEAD_LENGTH_BYTES = 4
+def message_parts(received: str | bytes) -> tuple[str | bytes, bytes]:
+    """The JSON of a message, and the image of a binary one, which is made as those of frames are.
+
+    Raises InvalidArgument.
+    """
+    begin, end = 0, len(received)
+    if isinstance(received, bytes):
+        begin, end = 4, 4 + int.from_bytes(received[:4], "little")
+        if len(received) < end:
+            raise InvalidArgument(f"the JSON of a binary message must have the {end - 4} bytes that its first 4 say")
+    if end - begin > MAX_POSE_BYTES:
+        raise InvalidArgument(f"the JSON of a message must have at most {MAX_POSE_BYTES} bytes, got {end - begin}")
+    return received[begin:end], received[end:] if isinstance(received, bytes) else b""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,17 +444,10 @@ class FrameHead(Contract):
 
 
 def read_incoming_frame(body: bytes) -> IncomingFrame:
-    """A real frame: the length of the JSON that follows (uint32, little endian), a FrameHead as JSON, the image.
-
-    As frames are sent over a stream. Raises InvalidArgument and its kinds.
-    """
-    start = _HEAD_LENGTH_BYTES + int.from_bytes(body[:_HEAD_LENGTH_BYTES], "little")
-    if not _HEAD_LENGTH_BYTES < start <= min(len(body), INLINE_BYTES):
-        raise InvalidArgument(
-            "a frame must be the length of its JSON (uint32, little endian), the JSON and the image", field="body"
-        )
-    head = read_json(body[_HEAD_LENGTH_BYTES:start].decode("utf-8", "replace"), FrameHead)
-    return IncomingFrame(pose=head.pose.exact("pose"), image=body[start:], number=head.number, time_s=head.time_s)
+    """A real frame: a FrameHead and the image, as `message_parts` has them. Raises InvalidArgument and its kinds."""
+    text, image = message_parts(body)
+    head = read_json(text, FrameHead)
+    return IncomingFrame(pose=head.pose.exact("pose"), image=image, number=head.number, time_s=head.time_s)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,6 @@ from ultragray_service.core.open_streams import OpenStream, StreamAnswer, Stream
 from ultragray_service.core.poses import FrameHeader
 from ultragray_service.core.previews import RealFrame
 from ultragray_service.core.streams import (
-    MAX_POSE_BYTES,
     FrameStream,
     Message,
     StreamMode,
@@ -36,7 +35,7 @@ from ultragray_service.core.streams import (
     unreadable,
 )
 from ultragray_service.errors import Refusal, StreamNotFound, statuses_of
-from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
+from ultragray_service.http.bodies import StreamMessage, adapter_of, message_parts, read_json
 from ultragray_service.http.dependencies import SceneName, ServiceDep, problems, require_uncompressed
 from ultragray_service.http.problems import problem_response
 from ultragray_service.http.protocol import HAND_OVER
@@ -181,25 +180,10 @@ class _Numbers:
 _NUMBERS = TypeAdapter(_Numbers)
 
 
-def _parts(received: str | bytes) -> tuple[str | bytes, bytes]:
-    """The JSON of a message, and the image of a binary one, which is made as those of frames are.
-
-    Raises InvalidArgument.
-    """
-    begin, end = 0, len(received)
-    if isinstance(received, bytes):
-        begin, end = 4, 4 + int.from_bytes(received[:4], "little")
-        if len(received) < end:
-            raise InvalidArgument(f"the JSON of a binary message must have the {end - 4} bytes that its first 4 say")
-    if end - begin > MAX_POSE_BYTES:
-        raise InvalidArgument(f"the JSON of a message must have at most {MAX_POSE_BYTES} bytes, got {end - begin}")
-    return received[begin:end], received[end:] if isinstance(received, bytes) else b""
-
-
 def _message_of(received: str | bytes, scene: str) -> Message:
     text: str | bytes = ""
     try:
-        text, image = _parts(received)
+        text, image = message_parts(received)
         message = read_json(text, StreamMessage)
         if message.real is None and isinstance(received, bytes):
             raise InvalidArgument("a binary message must tell of the real frame behind it", field="real")
