@@ -23,6 +23,7 @@ FRAMES, SIDE = 8, 128  # that both scenes show, for registration and gain; pixel
 FIT_SIDE, FIT_FRAMES = 128, 8  # pixels of a side; frames of a step
 RATES = {"means": 1e-3, "scales": 1e-2, "quats": 1e-2, "transmittances": 2e-2, "sh0": 1e-2, "shN": 1e-4}
 BETAS = (0.8, 0.95)
+NOWHERE_MM = 1e6
 _LEAST_PIXELS = 500  # that both support, for a gain
 _CONTRASTS = (0.5, 2.0)
 _LEAST_SHARE = 0.01  # of a scene at a place: it does not show there
@@ -138,10 +139,10 @@ def _views(scene: GaussianScene) -> TrainingViews | None:
 
 
 def _distance_mm(scene: GaussianScene, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [N]
-    """The interpolation distance of points to the training images; FAR_MM where what was there has been cut off."""
+    """The interpolation distance of points to the training images; NOWHERE_MM where what was there was cut off."""
     views = _views(scene)
     found = np.full(len(points), FAR_MM) if views is None else views.interpolation_mm(points)
-    return np.where(_is_kept(scene, points), found, FAR_MM)
+    return np.where(_is_kept(scene, points), found, NOWHERE_MM)
 
 
 def _is_kept(scene: GaussianScene, points: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]
