@@ -22,6 +22,7 @@ class HoldStill:
     most_age_ms: float | None = None  # from `measured_ns` of the pose to now; needs poses that are sent with it
     least_confidence: float | None = None  # 0 to 1
     most_error_mm: float | None = None  # expected of a foretold pose; needs a stream with `seen_after_ms`
+    least_trust: float | None = None  # of a preview, 0 to 1; needs a stream that real frames are sent to
     least_contact: float | None = None  # share of the scan lines, 0 to 1; needs `contact` in the settings
 
     def reason(self, frame: Frame | ClientError | None, *, waited_ms: float = 0.0) -> str | None:
@@ -44,6 +45,7 @@ class HoldStill:
                 return f"error of the pose {told if error_mm is None else f'of {error_mm:.2f} mm'}"
         for name, value, least in (
             ("confidence", found.confidence, self.least_confidence),
+            ("trust", None if frame.preview is None else frame.preview.trust, self.least_trust),
             ("contact", found.contact_share, self.least_contact),
         ):
             if least is not None and not (value is not None and value >= least):

@@ -6,10 +6,22 @@ import numpy as np
 import pytest
 
 from ultragray_client import Client, HoldStill, RenderSettings
-from ultragray_client.contract import Prediction
+from ultragray_client.contract import Prediction, Preview
 from ultragray_client.errors import DeadlineExceeded
 
 from .conftest import KEY
+
+PREVIEW = Preview(
+    real_age_ms=300.0,
+    moved_mm=2.0,
+    is_real=False,
+    expected_error=0.1,
+    agreement=0.5,
+    trust=0.4,
+    offset_mm=0.0,
+    offset_deg=0.0,
+    disagrees=False,
+)
 
 
 @pytest.fixture
@@ -38,12 +50,15 @@ def test_a_frame_within_all_limits_is_acted_on(frame):
         (HoldStill(most_age_ms=19), {"latency_ms": float("nan")}, "age of nan ms"),
         (HoldStill(least_confidence=0.81), {}, "confidence of 0.80"),
         (HoldStill(least_confidence=0.1), {"confidence": None}, "confidence is not told"),
+        (HoldStill(least_trust=0.5), {}, "trust is not told"),
+        (HoldStill(least_trust=0.5), {"preview": PREVIEW}, "trust of 0.40"),
+        (HoldStill(least_trust=0.4), {"preview": PREVIEW}, None),
         (HoldStill(least_contact=0.9), {"contact_share": 0.5}, "contact of 0.50"),
         (HoldStill(least_contact=0.9), {"contact_share": None}, "contact is not told"),
     ],
 )
 def test_a_limit_holds(frame, still, changes, expected):
-    own = {"latency_ms", "prediction"} & changes.keys()
+    own = {"latency_ms", "prediction", "preview"} & changes.keys()
     told = replace(frame.extrapolation, **{name: changes[name] for name in changes.keys() - own})
     assert still.reason(replace(frame, extrapolation=told, **{name: changes[name] for name in own})) == expected
 

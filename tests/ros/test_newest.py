@@ -107,14 +107,25 @@ def client(ros_service):
         yield client
 
 
-def newest(client, taker, scene="demo", timeout_s=300.0):
-    return NewestFrames(client, scene, SMALL, timeout_s=timeout_s, take=taker.take, tell=taker.errors.append)
+def newest(client, taker, scene="demo", timeout_s=300.0, **more):
+    return NewestFrames(client, scene, SMALL, timeout_s=timeout_s, take=taker.take, tell=taker.errors.append, **more)
 
 
 def moved(x_mm):
     pose = np.eye(4)
     pose[0, 3] = x_mm
     return pose
+
+
+def test_frames_are_those_of_when_they_are_seen_by_the_stamps_of_poses(client):
+    taker = Taker()
+    frames = newest(client, taker, seen_after_ms=100.0)
+    frames.render(moved(0.0), 0, age_s=0.2)
+    wait_until(lambda: taker.frames)
+    frame = taker.frames[0][0]
+    frames.close()
+    assert frame.latency_ms > 200.0
+    assert frame.prediction.ahead_ms == 100.0, "of a first pose: no latency is known yet, and nothing is foretold"
 
 
 def test_the_newest_pose_takes_the_place_of_those_that_wait(client):
