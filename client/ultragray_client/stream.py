@@ -216,7 +216,7 @@ class FrameStream(_PoseStream):
                 is_opening = bool(unsent) and unsent[0] is self._opening
                 if self._acknowledgement and not is_opening:
                     message, self._acknowledgement = self._acknowledgement, None
-                elif self._real and not is_opening and (self._is_latest or not unsent):
+                elif self._real and not is_opening:
                     message, self._real = self._real, None
                 elif unsent:
                     message = unsent.popleft()

@@ -1,5 +1,6 @@
 """Real frames that come late, of a probe that is elsewhere in the scene than its poses say, or of no such scene."""
 
+import asyncio
 import shutil
 import time
 
@@ -9,7 +10,7 @@ import pytest
 from ultragray import render
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import png_file
-from ultragray_client import Client, RenderSettings, errors
+from ultragray_client import AsyncClient, Client, RenderSettings, errors
 
 from ..waiting import Deadline
 
@@ -78,3 +79,18 @@ def test_a_real_frame_that_is_none_is_refused_and_the_stream_goes_on(stream):
         stream.receive()
     stream.send(POSE)
     assert stream.receive().preview is None
+
+
+def test_real_frames_are_sent_beside_asynchronous_poses(phantom):
+    async def first_preview():
+        image, deadline = real((0.0, 0.0, 0.0)), Deadline(120)
+        async with AsyncClient(phantom.grpc) as client, client.stream("spine", SETTINGS, mode="latest") as stream:
+            while not deadline.passed:
+                now_ns = time.monotonic_ns()
+                await stream.send(POSE, measured_ns=now_ns)
+                if (preview := (await stream.receive()).preview) is not None:
+                    return preview
+                await stream.send_real(image, now_ns)
+        return None
+
+    assert asyncio.run(first_preview()).agreement > 0.9

@@ -116,10 +116,11 @@ class StreamPreview:
 
         None: no real frame is of such frames.
         """
-        began, newest = time.perf_counter(), self._newest
-        if newest is None or self._previewer is None or result.settings.view != self._view:
-            return result, None
+        began = time.perf_counter()
         async with self._turn:
+            newest, agreed = self._newest, self._agreement
+            if newest is None or self._previewer is None or result.settings.view != self._view:
+                return result, None
             shown = await asyncio.to_thread(self._previewer.show, _grey(result), pose)
         data = in_type(shown.frame, result.settings.encoding.pixel_type).tobytes()
         confidence = result.extrapolations[0].confidence
@@ -130,11 +131,11 @@ class StreamPreview:
             moved_mm=round(shown.moved_mm, 3),
             is_real=shown.is_real,
             expected_error=None if shown.expected_error is None else round(shown.expected_error, 4),
-            agreement=round(self._agreement, 3),
-            trust=None if confidence is None else round(confidence * max(self._agreement, 0.0), 3),
+            agreement=round(agreed, 3),
+            trust=None if confidence is None else round(confidence * max(agreed, 0.0), 3),
             offset_mm=round(offset_mm, 3),
             offset_deg=round(offset_deg, 3),
-            disagrees=self._agreement < AGREES,
+            disagrees=agreed < AGREES,
         )
         encode_ms = result.encode_ms + 1e3 * (time.perf_counter() - began)
         return replace(result, data=data, encode_ms=encode_ms), told
