@@ -299,10 +299,17 @@ def console(measured: Document) -> Lines:
 
 
 def environment(measured: Document) -> Lines:
-    """Steps a second of a random policy, by size and contact."""
-    rows = ({**row, "contact": row["contact"] or "assumed"} for row in measured["rows"])
-    shown = {"Frame": "{side}x{side}", "Contact": "{contact}", "Steps/s": "{steps_per_s:.0f}"}
-    return columns(rows, {**shown, "p50 ms": "{p50_ms:.2f}", "p99 ms": "{p99_ms:.2f}"})
+    """Steps a second of a random policy, by scene, size and number of environments; and the load meanwhile."""
+    yield from of_rows(
+        Scene="{scene}",
+        Gaussians="{gaussians:,}",
+        Frame="{side}x{side}",
+        Environments="{environments}",
+        Steps_a_second="{steps_per_s:,.0f}",
+        Best_of_the_rounds="{best_steps_per_s:,.0f}",
+        CPU_ms_a_step="{cpu_ms:.2f}",
+    )(measured)
+    yield from ("", f"The machine's load meanwhile, all programs together: {measured['load']:.1f}.")
 
 
 @dataclass(frozen=True)

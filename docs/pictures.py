@@ -56,7 +56,7 @@ from ultragray.samplers import AroundSampler
 from ultragray.scene.confidence import Assessor, supported
 from ultragray.scene.edits import InsertEdit
 from ultragray.scene.shapes import SphereShape, TubeShape
-from ultragray_studies.gym import StandardPlaneEnv
+from ultragray_studies.gym import UltragrayEnv
 from ultragray_studies.hand import Errors, HandSweep
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -305,7 +305,7 @@ def draw_cases(scene: GaussianScene, path: Path) -> None:
 def draw_standard_plane(scene: GaussianScene, path: Path) -> None:
     """Frames of an episode of the agent in examples/, and the goal."""
     agent = runpy.run_path(str(EXAMPLES / "standard_plane.py"))["Climber"](np.random.default_rng(0))
-    env = StandardPlaneEnv(scene, height=SIDE, width=SIDE, start_mm=6.0, start_deg=6.0)
+    env = UltragrayEnv(scene, height=SIDE, width=SIDE, start_mm=6.0, start_deg=6.0)
     frame, told = env.reset(seed=3)
     seen, reward = [(0, frame, told)], -np.inf
     reached = False

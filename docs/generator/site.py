@@ -23,7 +23,7 @@ from ultragray.scene.confidence import Extrapolation
 from ultragray.scene.info import SceneInfo
 from ultragray_service.http.bodies import RealFrameHeader, RenderBody, Stamps, StreamMessage
 from ultragray_service.http.routes.streams import FrameMessage
-from ultragray_studies.gym.standard_plane import StandardPlaneSettings
+from ultragray_studies.gym import ScanSettings
 
 from . import interfaces, product, python_api
 
@@ -50,7 +50,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "training settings": product.training_settings,
     "scene metadata": partial(product.keys, SceneInfo),
     "display": partial(product.keys, Display, "Setting"),
-    "standard plane": partial(product.keys, StandardPlaneSettings, "Argument"),
+    "environments": partial(product.keys, ScanSettings, "Argument"),
     "confidence": partial(product.told, Extrapolation, "Figure"),
     "settings used": partial(product.told, SettingsUsed, "Setting"),
     "render body": partial(product.keys, RenderBody),

@@ -74,10 +74,10 @@ test("frames are as alike as the gymnasium environment says", () => {
   };
   const [one, other] = [frame(1), frame(2)];
   const program = `import json, sys
-import numpy as np
-from ultragray_studies.gym.standard_plane import Target
-one, other = (np.array(values, np.uint8).reshape(48, 64) for values in json.load(sys.stdin))
-print(json.dumps([Target(one).similarity(other), Target(one).similarity(one), Target(one).similarity(one * 0)]))`;
+import torch
+from ultragray_studies.gym.tasks import Target
+one, other = (torch.tensor(values, dtype=torch.uint8).reshape(48, 64) for values in json.load(sys.stdin))
+print(json.dumps(Target(one).similarity(torch.stack([other, one, one * 0])).tolist()))`;
   const environment = { ...process.env, PYTHONPATH: `${SOURCES}:studies`, OMP_NUM_THREADS: "1" };
   const input = JSON.stringify([one, other].map(({ pixels }) => [...pixels()]));
   const expected = JSON.parse(execFileSync(PYTHON, ["-c", program], { env: environment, input }));

@@ -4,6 +4,7 @@ import gymnasium
 import ultragray_studies.gym
 
 env = gymnasium.make("ultragray/StandardPlane-v0", scene="scene.ugr")
+many = gymnasium.make_vec("ultragray/StandardPlane-v0", num_envs=64, scene="scene.ugr")
 """
 
 from __future__ import annotations
@@ -16,16 +17,28 @@ except ImportError:
     advice = "pip install 'ultragray-studies[gym]'"
     raise ExtraMissing(f"ultragray_studies.gym needs gymnasium, which is not installed: {advice}") from None
 
-from ultragray_studies.gym.standard_plane import StandardPlaneEnv, StandardPlaneSettings
+from ultragray_studies.gym.scan import ScanSettings
+from ultragray_studies.gym.single import UltragrayEnv
+from ultragray_studies.gym.tasks import TaskName
+from ultragray_studies.gym.vector import UltragrayVectorEnv
 
-__all__ = ["STANDARD_PLANE", "StandardPlaneEnv", "StandardPlaneSettings"]
+__all__ = ["ENVIRONMENTS", "STANDARD_PLANE", "ScanSettings", "TaskName", "UltragrayEnv", "UltragrayVectorEnv"]
 
 STANDARD_PLANE = "ultragray/StandardPlane-v0"
+ENVIRONMENTS = {
+    STANDARD_PLANE: TaskName.STANDARD_PLANE,
+    "ultragray/Coverage-v0": TaskName.COVERAGE,
+    "ultragray/Vessel-v0": TaskName.VESSEL,
+    "ultragray/Needle-v0": TaskName.NEEDLE,
+}
 MOST_STEPS = 200  # of an episode made by its name
 
-if STANDARD_PLANE not in gymnasium.registry:
-    gymnasium.register(
-        STANDARD_PLANE,
-        entry_point=f"{__name__}.standard_plane:StandardPlaneEnv",
-        max_episode_steps=MOST_STEPS,
-    )
+for _name, _task in ENVIRONMENTS.items():
+    if _name not in gymnasium.registry:
+        gymnasium.register(
+            _name,
+            entry_point=f"{__name__}.single:UltragrayEnv",
+            vector_entry_point=f"{__name__}.vector:UltragrayVectorEnv",
+            max_episode_steps=MOST_STEPS,
+            kwargs={"task": _task.value},
+        )

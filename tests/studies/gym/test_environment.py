@@ -12,8 +12,8 @@ from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe
 from ultragray.rendering.contact import Skin, Touch
 from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact
-from ultragray_studies.gym import STANDARD_PLANE, StandardPlaneEnv
-from ultragray_studies.gym.standard_plane import moved
+from ultragray_studies.gym import STANDARD_PLANE, UltragrayEnv
+from ultragray_studies.gym.scan import moved
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
@@ -33,7 +33,7 @@ def scene(request, random_scene):
 
 @pytest.fixture
 def env(scene):
-    return StandardPlaneEnv(scene, **SMALL)
+    return UltragrayEnv(scene, **SMALL)
 
 
 @pytest.mark.parametrize("with_pose", [False, True])
@@ -59,7 +59,7 @@ def test_it_is_made_by_name_from_a_file(scene, tmp_path):
 
 def test_the_same_seed_is_the_same_episode(scene):
     def episode(seed):
-        made = StandardPlaneEnv(scene, **SMALL)
+        made = UltragrayEnv(scene, **SMALL)
         made.action_space.seed(seed)
         frames, rewards = [made.reset(seed=seed)[0]], []
         for _ in range(5):
@@ -92,8 +92,12 @@ def test_the_frame_is_the_librarys(env, scene):
     np.testing.assert_array_equal(frame[..., 0], to_uint8(expected["bmode"][0].numpy()))
 
 
+def one_moved(pose, shift_mm, turn_deg=(0.0, 0.0, 0.0), pivot_mm=0.0):
+    return moved(pose[None], np.array([shift_mm]), np.array([turn_deg]), pivot_mm)[0]
+
+
 def test_an_action_moves_the_face_in_the_probes_frame(scene):
-    env = StandardPlaneEnv(scene, step_mm=2.0, step_deg=3.0, **SMALL)
+    env = UltragrayEnv(scene, step_mm=2.0, step_deg=3.0, **SMALL)
     pivot = scene.info.probe_or(None).pivot_depth_mm
     _, info = env.reset(seed=5)
     before = info["pose"]
@@ -103,14 +107,14 @@ def test_an_action_moves_the_face_in_the_probes_frame(scene):
     np.testing.assert_allclose(before[:3, :3].T @ (faces[1] - faces[0])[:3], [1.0, -0.5, 0.25], atol=1e-9)
     turn = before[:3, :3].T @ after[:3, :3]
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) == pytest.approx(3.0 * np.linalg.norm(action[3:]), abs=1e-6)
-    np.testing.assert_allclose(after, moved(before, 2.0 * action[:3], 3.0 * action[3:], pivot), atol=1e-9)
+    np.testing.assert_allclose(after, one_moved(before, 2.0 * action[:3], 3.0 * action[3:], pivot), atol=1e-9)
     env.reset(options={"pose": before})
     clipped = env.step(np.array([50.0, 0, 0, 0, 0, 0]))[4]["pose"]
     np.testing.assert_allclose(before[:3, :3].T @ (clipped - before)[:3, 3], [2.0, 0.0, 0.0], atol=1e-6)
 
 
 def test_the_goal_is_the_best_place_and_ends_the_episode(env):
-    away = moved(env.goal, np.array([0.0, 3.0, 0.0]), np.zeros(3), 0.0)
+    away = one_moved(env.goal, [0.0, 3.0, 0.0])
     _, info = env.reset(options={"pose": away})
     assert info["distance_mm"] == pytest.approx(3.0)
     rewards, ends = [], []
@@ -120,17 +124,17 @@ def test_the_goal_is_the_best_place_and_ends_the_episode(env):
         ends.append(terminated)
         assert not truncated
     assert rewards[0] < rewards[1] <= 0.0
-    assert rewards[1] == pytest.approx(0.0, abs=1e-6)
+    assert rewards[1] == pytest.approx(0.0, abs=1e-5)
     assert info["similarity"] == pytest.approx(1.0)
     assert ends == [False, True]
 
 
 def test_the_goal_is_not_reached_in_the_air(scene):
-    env = StandardPlaneEnv(scene, reached_mm=5.0, **SMALL)
+    env = UltragrayEnv(scene, reached_mm=5.0, **SMALL)
     still = np.zeros(6)
-    env.reset(options={"pose": moved(env.goal, np.array([0.0, 0.0, -3.0]), np.zeros(3), 0.0)})
+    env.reset(options={"pose": one_moved(env.goal, [0.0, 0.0, -3.0])})
     assert not env.step(still)[2]
-    env.reset(options={"pose": moved(env.goal, np.array([0.0, 0.0, 3.0]), np.zeros(3), 0.0)})
+    env.reset(options={"pose": one_moved(env.goal, [0.0, 0.0, 3.0])})
     assert env.step(still)[2]
 
 
@@ -142,7 +146,7 @@ def test_the_probe_stays_around_the_goal(env):
 
 
 def test_the_pose_is_told_from_the_start_on(scene):
-    made = StandardPlaneEnv(scene, with_pose=True, **SMALL)
+    made = UltragrayEnv(scene, with_pose=True, **SMALL)
     observation, info = made.reset(seed=2)
     np.testing.assert_allclose(observation["pose"], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], atol=1e-6)
     start = info["pose"]
@@ -153,7 +157,7 @@ def test_the_pose_is_told_from_the_start_on(scene):
 
 
 def test_pictures_show_frame_and_goal(scene):
-    made = StandardPlaneEnv(scene, render_mode="rgb_array", **SMALL)
+    made = UltragrayEnv(scene, render_mode="rgb_array", **SMALL)
     frame, _ = made.reset(seed=0)
     picture = made.render()
     assert picture.shape == (24, 40, 3)
@@ -161,14 +165,14 @@ def test_pictures_show_frame_and_goal(scene):
     made.reset(options={"pose": made.goal})
     again = made.render()
     np.testing.assert_array_equal(again[:, :20], again[:, 20:])
-    assert StandardPlaneEnv(scene, **SMALL).render() is None
+    assert UltragrayEnv(scene, **SMALL).render() is None
 
 
 def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene):
     bare = random_scene(50, info={"probe": LINEAR})
     with pytest.raises(InvalidArgument, match="contact needs a scene"):
-        StandardPlaneEnv(bare, np.eye(4), **SMALL).reset(seed=0)
-    _, info = StandardPlaneEnv(bare, np.eye(4), contact=None, **SMALL).reset(seed=0)
+        UltragrayEnv(bare, np.eye(4), **SMALL).reset(seed=0)
+    _, info = UltragrayEnv(bare, np.eye(4), contact=None, **SMALL).reset(seed=0)
     assert info["contact_share"] == 1.0
 
 
@@ -186,13 +190,13 @@ def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene):
 )
 def test_mistakes_are_told(scene, given, error, match):
     with pytest.raises(error, match=match):
-        StandardPlaneEnv(scene, **{**SMALL, **given})
+        UltragrayEnv(scene, **{**SMALL, **given})
 
 
 def test_an_action_must_be_six_numbers(env):
     env.reset(seed=0)
     for action in (np.zeros(5), np.full(6, np.nan), "up", ["a"] * 6, [[0, 0, 0], [0, 0]], None):
-        with pytest.raises(InvalidArgument, match="an action must be 6 finite numbers"):
+        with pytest.raises(InvalidArgument, match="finite numbers from -1 to 1"):
             env.step(action)
 
 
@@ -203,5 +207,5 @@ def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env):
         env.reset(options={"pose": FAR_AWAY})
     with pytest.raises(InvalidPose, match=r"options\.pose must hold real numbers"):
         env.reset(options={"pose": "here"})
-    with pytest.raises(InvalidArgument, match="options may hold pose alone, got poes"):
+    with pytest.raises(InvalidArgument, match="options may hold pose and reset_mask, got poes"):
         env.reset(options={"poes": env.goal})
