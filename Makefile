@@ -261,7 +261,7 @@ speckle: $(VENV)/installed-dev  ## how true natural speckle is, scene by scene, 
 	@$(BIN)/python benchmarks/figures.py show speckle
 	$(KEEP) speckle
 
-environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environments with a random policy; trains a small scene first
+environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environments with a random policy
 	$(READY)
 	$(BIN)/python benchmarks/environment.py
 	@$(BIN)/python benchmarks/figures.py show environment

@@ -390,6 +390,7 @@ BLOCKS = {
     "compressed": Block("compressed", compressed.kept),
     "editing": Block("editing", editing.told),
     "localization": Block("localization", localization.found_frames),
+    "frames in motion": Block("localization", localization.frames_in_motion, localization.of_motion),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
     "speckle": Block("speckle", speckle.textures),
     "decorrelation": Block("speckle", speckle.decorrelations),

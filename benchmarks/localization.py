@@ -10,7 +10,9 @@ on, which no held-out image has a part in, and against the true poses where they
 from __future__ import annotations
 
 import math
+import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +24,9 @@ from hand import ERRORS, SWEEPS
 from measuring import Document, Lines, columns, measure_runs
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.localization.search import Motions, localize
+from ultragray.learn.localization.appearance import Motions
+from ultragray.learn.localization.search import Tracker, localize
+from ultragray.learn.localization.settings import Localization, SearchKind
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.poses import held_out_on_path
@@ -35,6 +39,7 @@ from ultragray_studies.report import train_and_evaluate
 
 PHANTOM, SHAKING = "phantom", "a hand, noise of 0.13 mm and 0.1°"
 SETS = (PHANTOM, SHAKING, "ultranerf_liver", "spine_phantom", "liver_convex")
+IN_MOTION = f"{PHANTOM} in motion"
 OFF_MM, OFF_DEG = 3.0, 5.0
 FOUND_MM, FOUND_DEG = 0.5, 1.0
 SAME_MM = 0.3  # that two searches for a frame may end apart
@@ -65,6 +70,40 @@ def measure(name: str, data_folder: Path) -> Document:
         recorded, exact = (truth.recorded(ERRORS[error]) for error in (SHAKING.removeprefix("a hand, "), "none"))
         return row(trained(recorded, true=exact.val.poses))
     return row(trained(load_dataset(data_folder / name)))
+
+
+def in_motion(_: Path) -> Document:
+    """Frames of the phantom one after another, 0.7 mm and 0.3° apart: each from the one before, and each from nowhere.
+
+    On all cores. The first frame of all makes the index of places, and is told apart.
+    """
+    torch.set_num_threads(os.cpu_count() or 1)
+    poses = freehand_poses(120, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[40 : 40 + MOST_FRAMES]
+    images = simulate(poses, probe=PHANTOM_PROBE, height=PHANTOM_IMAGE_SIDE, width=PHANTOM_IMAGE_SIDE)
+    scene, motions = load_demo_scene(), Motions.of(PHANTOM_PROBE)
+    tracker = Tracker(scene, poses[0])
+    tracker.locate(images[0])  # searched for, as the motion is not known yet
+    index_s = timed(lambda: localize(scene, images[0], search=SearchKind.ANYWHERE))[1]
+    ways = {
+        "tracked": tracker.locate,
+        "anywhere": lambda image: localize(scene, image, search=SearchKind.ANYWHERE),
+    }
+    rows = {}
+    for way, locate in ways.items():
+        found, wall_s, cpu_s = zip(*(timed(partial(locate, image)) for image in images[1:]), strict=True)
+        rows[way] = {
+            **scores(motions, np.stack([one.pose for one in found]), poses[1:]),
+            "is_found": float(np.mean([one.is_found for one in found])),
+            **{f"{name}_ms": 1000.0 * float(np.median(took)) for name, took in (("wall", wall_s), ("cpu", cpu_s))},
+        }
+    return {"frames": len(poses) - 1, "rows": rows, "index_s": index_s, "load": os.getloadavg()[0]}
+
+
+def timed(locate: Callable[[], Localization]) -> tuple[Localization, float, float]:
+    """What is found, the time that it takes, and the CPU time."""
+    began_s = time.perf_counter(), time.process_time()
+    found = locate()
+    return found, time.perf_counter() - began_s[0], time.process_time() - began_s[1]
 
 
 def trained(dataset: Dataset, true: FloatArray | None = None) -> HeldOut:  # [V, 4, 4] mm
@@ -146,5 +185,32 @@ def found_frames(figures: Document) -> Lines:
     )
 
 
+def of_motion(figures: Document) -> Document:
+    """The run that the table of frames in motion is of."""
+    return {IN_MOTION: figures[IN_MOTION]}
+
+
+def frames_in_motion(figures: Document) -> Lines:
+    """Frames that were tracked, and those that were looked for anywhere."""
+    run = figures[IN_MOTION]
+    yield from columns(
+        [{"way": way, **run, **row} for way, row in run["rows"].items()],
+        {
+            "way": "{way}",
+            "frames": "{frames}",
+            "within 0.5 mm and 1°": "{within:.0%}",
+            "median error": "{median_mm:.2f} mm, {median_deg:.2f}°",
+            "time of a frame": "{wall_ms:.0f} ms",
+            "CPU time": "{cpu_ms:.0f} ms",
+        },
+    )
+    yield from (
+        "",
+        f"The first search makes the index, once for a scene and a probe: {run['index_s']:.1f} s. The load of the "
+        f"machine meanwhile, all programs together: {run['load']:.1f}.",
+    )
+
+
 if __name__ == "__main__":
-    measure_runs("localization", __doc__, {name: partial(measure, name) for name in SETS}, threads=THREADS)
+    runs: dict[str, Callable[[Path], Document]] = {name: partial(measure, name) for name in SETS}
+    measure_runs("localization", __doc__, {**runs, IN_MOTION: in_motion}, threads=THREADS)

@@ -553,22 +553,24 @@ class _Client(Group[AnyConnection]):
         self,
         scene: str,
         image: npt.ArrayLike | bytes,
-        start: PoseLike,
+        start: PoseLike | None = None,
         *,
         probe: Probe | None = None,
         registration: str | None = None,
         within_mm: float = 3.0,
         within_deg: float = 5.0,
+        search: str = "near",
         timeout_s: float | None = None,
     ) -> Call[Localization]:
         """Where in a scene a real frame was taken, looked for about `start`, which may be off by the two `within`.
 
+        `search` track: `start` is the pose of the frame before; anywhere: nothing is known, no start is needed.
         `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
         scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
         its pose can be used. With a `registration` the start is a pose of the flange in its base, and the answer has
         such a pose as well. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
         """
-        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg)
+        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg, search)
         return Call("RenderService.Localize", request, _one(Localization), timeout_s)
 
     @operation

@@ -269,15 +269,24 @@ def grey_pixels(image: npt.ArrayLike) -> npt.NDArray[np.uint8]:  # [H, W]
 def localize_message(
     scene: str,
     image: npt.ArrayLike | bytes,
-    start: PoseLike,
+    start: PoseLike | None,
     probe: Probe | None,
     registration: str | None,
     within_mm: float,
     within_deg: float,
+    search: str,
 ) -> rendering_pb2.LocalizeRequest:
     """The request of a search. Raises InvalidArgument for what is no grey image, and InvalidPose."""
-    asked = {"probe": probe, "registration": registration, "within_mm": within_mm, "within_deg": within_deg}
-    request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene, start=pose_message(start, field="start"))
+    asked = {
+        "probe": probe,
+        "registration": registration,
+        "within_mm": within_mm,
+        "within_deg": within_deg,
+        "search": search,
+    }
+    request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene)
+    if start is not None:
+        request.start.CopyFrom(pose_message(start, field="start"))
     put_image(request, image)
     return request
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ultragray.geometry.probe import Probe as Probe
     from ultragray.geometry.probe import RadialProbe as RadialProbe
     from ultragray.geometry.probe import SteeredProbe as SteeredProbe
+    from ultragray.learn.localization.search import Tracker as Tracker
     from ultragray.learn.localization.search import localize as localize
     from ultragray.learn.localization.settings import Localization as Localization
     from ultragray.learn.planning.search import plan_views as plan_views
@@ -56,7 +57,7 @@ _MODULES = {
         "RadialProbe",
         "SteeredProbe",
     ),
-    "learn.localization.search": ("localize",),
+    "learn.localization.search": ("Tracker", "localize"),
     "learn.localization.settings": ("Localization",),
     "learn.planning.search": ("plan_views",),
     "learn.planning.settings": ("PlanSettings", "ViewPlan"),

@@ -19,6 +19,7 @@ from ultragray.geometry.registration import (
     rows,
     save_registration,
 )
+from ultragray.learn.localization.search import move_together
 from ultragray.learn.registration import register_frames
 from ultragray.phantom.demo import demo_poses, load_demo_scene
 
@@ -143,6 +144,19 @@ def test_frames_register_a_robot_and_one_foreign_frame_does_no_harm():
     shifts_mm, turns_deg = pose_residuals(found.fit.base_to_scene @ flanges @ mounting, poses)
     assert shifts_mm.max() < 0.3
     assert turns_deg.max() < 0.3
+
+
+def test_one_motion_of_all_frames_is_found_by_all_of_them():
+    """Frames so small and few of structures that none tells its own place so well."""
+    scene, rng = load_demo_scene(), np.random.default_rng(10)
+    poses = demo_poses(7)[1:6:2]
+    frames = render(scene, None, poses, height=96, width=72, outputs=("bmode",))["bmode"].detach().numpy()
+    off = motion(rng, 1.5, 0.0)
+    off[:3, 3] = poses[1, :3, 3] - off[:3, :3] @ poses[1, :3, 3] + (0.5, -0.6, 0.4)
+    moved = move_together(scene, list(frames), off @ poses) @ off
+    shifts_mm, turns_deg = pose_residuals(moved @ poses, poses)
+    assert shifts_mm.max() < 0.1
+    assert turns_deg.max() < 0.1
 
 
 def test_frames_that_show_nothing_are_told():

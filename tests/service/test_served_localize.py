@@ -11,6 +11,7 @@ from ultragray import render
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import png_file, to_uint8
 from ultragray_client import Client
+from ultragray_client.errors import InvalidArgument
 
 from ..waiting import Deadline
 
@@ -102,6 +103,24 @@ def test_start_and_answer_are_in_the_frame_of_a_registration(phantom, http, pixe
     np.testing.assert_allclose(told["flange_to_base"], found.flange_to_base, atol=1e-9)
     refused = http.post("/v1/scenes/spine:localize", json=body(png, registration="nobody"))
     assert (refused.status_code, refused.json()["field"]) == (404, "registration")
+
+
+def test_a_frame_is_tracked_and_found_from_nowhere_at_both_doors(phantom, http, pixels, png):
+    tracked = http.post("/v1/scenes/spine:localize", json=body(png, search="track")).json()
+    np.testing.assert_allclose(tracked["pose"], POSE, atol=0.2)
+    asked = {key: value for key, value in body(png, search="anywhere").items() if key != "start"}
+    told = http.post("/v1/scenes/spine:localize", json=asked).json()
+    np.testing.assert_allclose(told["pose"], POSE, atol=0.2)
+    with Client(phantom.grpc, timeout_s=300.0) as client:
+        found = client.localize("spine", pixels, search="anywhere")
+        on = client.localize("spine", pixels, start(), search="track")
+        with pytest.raises(InvalidArgument, match="start is required, unless search is anywhere"):
+            client.localize("spine", pixels)
+    np.testing.assert_allclose(found.pose, told["pose"], atol=1e-6)
+    np.testing.assert_allclose(on.pose, tracked["pose"], atol=1e-6)
+    del asked["search"]
+    refused = http.post("/v1/scenes/spine:localize", json=asked)
+    assert (refused.status_code, refused.json()["field"]) == (422, "start")
 
 
 def test_a_frame_of_something_else_is_told_as_not_found(http):

@@ -2,13 +2,15 @@
 
 Each frame is looked for in the scene about where the start puts it. The frames that are found vote: of the transforms
 that each implies, the one counts that the others agree with best (the least median of residuals, Rousseeuw 1984), and
-frames far from it are outliers. Frames that were not found, or are outliers, are looked for once more from there.
+frames far from it are outliers. Frames that were not found, or are outliers, are looked for once more from there. At
+last one motion of all frames that agree is found by all their images at once (`search.move_together`): the robot knows
+better how they lie to each other than each image knows where it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.registration import LEVER_MM, PoseFit, pose_residuals, register_poses
-from ultragray.learn.localization.search import localize
+from ultragray.learn.localization.search import localize, move_together
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization
 from ultragray.scene.gaussians import GaussianScene
 
@@ -85,6 +87,14 @@ def register_frames(
         localizations[index] = search(fit.base_to_scene, int(index))
     agreeing = _agreeing(in_base, localizations)
     fit = _fit_of(flanges, localizations, agreeing, mounting)
+    chosen = np.flatnonzero(agreeing)
+    placed = fit.base_to_scene @ in_base[chosen]
+    motion = move_together(scene, [images[index] for index in chosen.tolist()], placed, probe=probe, backend=backend)
+    joint = motion @ fit.base_to_scene
+    residuals = pose_residuals(
+        joint @ in_base[chosen], np.stack([localizations[index].pose for index in chosen.tolist()])
+    )
+    fit = replace(fit, base_to_scene=joint, residuals_mm=residuals[0], residuals_deg=residuals[1])
     return FrameFit(fit, tuple(int(index) for index in np.flatnonzero(agreeing)), tuple(localizations))
 
 

@@ -41,6 +41,13 @@ class Speckle(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SPECKLE_OFF: _ClassVar[Speckle]
     SPECKLE_NATURAL: _ClassVar[Speckle]
 
+class SearchKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SEARCH_KIND_UNSPECIFIED: _ClassVar[SearchKind]
+    SEARCH_KIND_NEAR: _ClassVar[SearchKind]
+    SEARCH_KIND_TRACK: _ClassVar[SearchKind]
+    SEARCH_KIND_ANYWHERE: _ClassVar[SearchKind]
+
 class BelowConfidence(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     BELOW_CONFIDENCE_UNSPECIFIED: _ClassVar[BelowConfidence]
@@ -72,6 +79,10 @@ CONTACT_PRESSURE: Contact
 SPECKLE_UNSPECIFIED: Speckle
 SPECKLE_OFF: Speckle
 SPECKLE_NATURAL: Speckle
+SEARCH_KIND_UNSPECIFIED: SearchKind
+SEARCH_KIND_NEAR: SearchKind
+SEARCH_KIND_TRACK: SearchKind
+SEARCH_KIND_ANYWHERE: SearchKind
 BELOW_CONFIDENCE_UNSPECIFIED: BelowConfidence
 BELOW_CONFIDENCE_REFUSE: BelowConfidence
 BELOW_CONFIDENCE_MASK: BelowConfidence
@@ -146,7 +157,7 @@ class AssessPosesResponse(_message.Message):
     def __init__(self, extrapolations: _Optional[_Iterable[_Union[Extrapolation, _Mapping]]] = ...) -> None: ...
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "image", "image_height", "image_width", "start", "registration", "probe", "within_mm", "within_deg")
+    __slots__ = ("scene", "image", "image_height", "image_width", "start", "registration", "probe", "within_mm", "within_deg", "search")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -156,6 +167,7 @@ class LocalizeRequest(_message.Message):
     PROBE_FIELD_NUMBER: _ClassVar[int]
     WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
     WITHIN_DEG_FIELD_NUMBER: _ClassVar[int]
+    SEARCH_FIELD_NUMBER: _ClassVar[int]
     scene: str
     image: bytes
     image_height: int
@@ -165,7 +177,8 @@ class LocalizeRequest(_message.Message):
     probe: _geometry_pb2.Probe
     within_mm: float
     within_deg: float
-    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., registration: _Optional[str] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ...) -> None: ...
+    search: SearchKind
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., registration: _Optional[str] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ..., search: _Optional[_Union[SearchKind, str]] = ...) -> None: ...
 
 class AlongAxes(_message.Message):
     __slots__ = ("lateral", "elevation", "axial")

@@ -108,7 +108,7 @@ class RenderServiceServicer:
 
     def Localize(self, request, context):
         """Where in a scene a real frame was taken: its pose, looked for about one that is about right. It waits behind frames of
-        interactive callers, and counts as 100 frames of the key's limit.
+        interactive callers, and counts as 100 frames of the key's limit (as 10 where it tracks).
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -14,6 +14,7 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.poses import load_poses
 from ultragray.learn.localization.pixels import read_frame
+from ultragray.learn.localization.settings import SearchKind
 from ultragray.scene.info import read_header
 from ultragray_service.cli.terminal import (
     Backend,
@@ -44,15 +45,24 @@ POSE_SUFFIXES = (".npy",)
 @single(
     "ultragray localize liver.ugr frame.png --start pose.npy",
     "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
+    "ultragray localize liver.ugr frame.png --search anywhere",
 )
 def localize(
     scene: SceneFile,
     image: Annotated[
         Path, argument("The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.")
     ],
-    start: Annotated[Path, option("A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown=False)],
+    start: Annotated[
+        Path | None,
+        option(
+            "A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", default="needed, unless anywhere"
+        ),
+    ] = None,
     within_mm: Annotated[float, option("How far the start may be off.")] = 3.0,
     within_deg: Annotated[float, option("By which angle.")] = 5.0,
+    search: Annotated[
+        SearchKind, option("How much is known of the place: track: it is that of the frame before.")
+    ] = SearchKind.NEAR,
     output: Annotated[Path | None, output_option("The pose as .npy, [4, 4].", default="not written")] = None,
     force: Force = False,
     json: Json = False,
@@ -62,17 +72,17 @@ def localize(
     if output is not None:
         check_file(output, POSE_SUFFIXES, force=force)
     read_header(scene)
-    poses = load_poses(start)
-    if len(poses) != 1:
-        raise InvalidArgument(f"{start} must hold one pose, got {len(poses)}", field="start")
+    about = None if start is None else _one_pose(start, "start")
     pixels = read_frame(image)
 
     from ultragray import GaussianScene
-    from ultragray import localize as search
+    from ultragray import localize as sought
 
     with working("looking for the frame …"):
         loaded = GaussianScene.load(scene)
-        found = search(loaded, pixels, poses[0], within_mm=within_mm, within_deg=within_deg, backend=backend)
+        found = sought(
+            loaded, pixels, about, within_mm=within_mm, within_deg=within_deg, search=search, backend=backend
+        )
     if output is not None and found.is_found:
         _write_pose(output, found)
     document = asdict(found) | {"pose": found.pose.tolist()}

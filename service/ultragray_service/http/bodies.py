@@ -218,7 +218,9 @@ class LocalizeBody(LocalizationSettings):
     )
     image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
     image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
-    start: Pose = described("A pose that is about right.", error=InvalidPose)
+    start: Pose | None = described(
+        "A pose that is about right; needed unless search is anywhere.", None, error=InvalidPose
+    )
     registration: str | None = registration_field()
     timeout_ms: float | None = described(
         "A search that has not ended by then is given up (504).", None, above=0, high=MAX_TIMEOUT_MS

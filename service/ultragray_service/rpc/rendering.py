@@ -298,9 +298,7 @@ class RenderService:
         height, width = (
             getattr(request, side) if request.HasField(side) else None for side in ("image_height", "image_width")
         )
-        if not request.HasField("start"):
-            raise InvalidArgument("start is required", field="start")
-        start = read_pose(request.start, "start")
+        start = read_pose(request.start, "start") if request.HasField("start") else None
         sought = sought_frame(request.image, height, width, asked)
         registration = request.registration if request.HasField("registration") else None
         found = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)

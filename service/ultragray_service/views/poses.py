@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ultragray.contract import described
-from ultragray.errors import RenderFailed
+from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.pixels import EncodedFrame
-from ultragray.learn.localization.settings import Localization, LocalizationSettings
+from ultragray.learn.localization.settings import Localization, LocalizationSettings, SearchKind
 from ultragray.learn.planning.settings import PlanSettings, ViewPlan
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.scene.confidence import Assessor, Extrapolation
@@ -123,7 +123,7 @@ async def locate(
     rendering: Rendering,
     scene: str,
     sought: Sought,
-    start: FloatArray,  # [4, 4] mm, exact
+    start: FloatArray | None,  # [4, 4] mm, exact; None: anywhere
     deadline: float,
     registration: str | None,
 ) -> Located:
@@ -131,10 +131,21 @@ async def locate(
 
     `registration` leads the start into the scene, and the found pose back.
 
-    Raises what `_searched` raises.
+    Raises InvalidArgument where a start is needed, and what `_searched` raises.
     """
+    kind = sought.settings.search
+    if start is None and kind is not SearchKind.ANYWHERE:
+        raise InvalidArgument("start is required, unless search is anywhere", field="start")
+    about = np.eye(4) if start is None else start  # anywhere: it counts for nothing
+    frames = FRAMES_OF_A_SEARCH // 10 if kind is SearchKind.TRACK else FRAMES_OF_A_SEARCH
     result, plan = await _searched(
-        rendering, scene, sought.settings.probe, lambda plan: (sought, plan.placed(start)), deadline, registration
+        rendering,
+        scene,
+        sought.settings.probe,
+        lambda plan: (sought, plan.placed(about)),
+        deadline,
+        registration,
+        frames,
     )
     rendering.metrics.observe_search(result)
     return Located.of(result, plan)
@@ -147,16 +158,18 @@ async def _searched(
     search: Callable[[Plan], tuple[Search, FloatArray]],
     deadline: float,
     registration: str | None,
+    frames: int = FRAMES_OF_A_SEARCH,
 ) -> tuple[SearchResult[Any], Plan]:
     """What a search, and the pose that it starts from, come to until the `deadline` (time.monotonic(), s).
 
+    It counts as so many frames of the caller's limit.
     It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.search and
     RequestPlanner.plan raise, and RateLimited.
     """
     rendering.life.require_serving()
     account().target = scene
     plan = await rendering.planner.plan(scene, FrameSettings(probe=probe), Encoding.UINT8, registration=registration)
-    await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
+    await rendering.limits.take_frames(frames, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         what, start = search(plan)
         asked = RenderRequest(plan.scene, what, start[None], Priority.BATCH, deadline, plan.version, caller())

@@ -261,8 +261,8 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
             if view.confidences is not None:
                 told["confidence"] = view.confidences
                 if self.settings.low_confidence is LowConfidence.PENALTY:
-                    least = self.settings.min_confidence or 1.0
-                    lack = np.maximum(1.0 - view.confidences / least, 0.0)
+                    least = self.settings.min_confidence
+                    lack = np.maximum(1.0 - view.confidences / least, 0.0) if least else np.zeros(len(places))
                     worth = worth - torch.from_numpy(lack).float().to(self._device)
             rewards[at], done[places] = worth, judged.is_done
             for name, values in {**told, **judged.told, "pose": poses}.items():

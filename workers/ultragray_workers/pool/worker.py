@@ -296,6 +296,7 @@ class _Worker:
             probe=asked.probe,
             within_mm=asked.within_mm,
             within_deg=asked.within_deg,
+            search=asked.search,
             backend=self._backend,
             limits=self._limits(lambda _: "start"),
         )

@@ -1,13 +1,12 @@
-"""What a motion of the probe within its image plane does to a frame, by the frame alone: its pixels slide.
+"""Where a frame was taken: near a start, from the frame before, anywhere, and together with other frames.
 
-Shadows and gain slide along, which they would not quite do in a frame rendered there. To tell the next step of a search
-that is near enough, and it takes no rendering.
+Frames are compared as `appearance` has it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -18,148 +17,16 @@ from torch import Tensor
 from torch.nn import functional
 from torch.quasirandom import SobolEngine
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import Probe
-from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
-from ultragray.learn.sweep import pixel_positions_mm
-from ultragray.learn.training.poses import turned_by
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.rotations import turns_of
+from ultragray.learn.localization.appearance import IN_PLANE, Motions, Scale, places_after, slid
+from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings, SearchKind
 from ultragray.rendering.frames import render
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.scene.gaussians import GaussianScene
-
-IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
-
-
-def places_after(probe: Probe, motions: Tensor, rows: int, columns: int) -> Tensor:
-    """Where in a frame [rows, columns] the pixels of frames after motions [S, 4, 4] lie: [S, rows, columns, 2].
-
-    The two numbers are column and row in [-1, 1], as functional.grid_sample() takes them.
-    """
-    pixels = pixel_positions_mm(probe, rows, columns)
-    moves = motions.numpy()
-    moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]
-    depth, across = (share.reshape(rows, columns) for share in probe.lines.coordinates(pixels[:, 0], pixels[:, 2]))
-    rows_after, columns_after = probe.lines.coordinates(moved[..., 0], moved[..., 2])
-    places = np.stack(
-        [
-            2.0 * (columns_after - across[0, 0]) / (across[0, -1] - across[0, 0]) - 1.0,
-            2.0 * (rows_after - depth[0, 0]) / (depth[-1, 0] - depth[0, 0]) - 1.0,
-        ],
-        axis=-1,
-    )
-    return torch.from_numpy(places.reshape(len(motions), rows, columns, 2)).float()
-
-
-def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -> [K, S, H, W]
-    """Each frame after each step, by places_after(); what comes in from outside is as the edge was."""
-    count, rows, columns = frames.shape
-    repeated = frames[:, None].expand(count, len(places), rows, columns).reshape(-1, 1, rows, columns)
-    grid = places.repeat(count, 1, 1, 1)
-    after = functional.grid_sample(repeated, grid, mode="bicubic", padding_mode="border", align_corners=True)
-    return after.reshape(count, len(places), rows, columns)
-
-
-# Small motions of the probe: shifts along its own axes and turns about the middle of its image, all in mm.
-#
-# A turn is given by the way that it moves a point at the typical distance from the middle, so that steps of all six
-# numbers weigh alike.
-
-GRID = 16  # rows and columns of the image that are looked at
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """Motions of one probe."""
-
-    middle_mm: Tensor  # [3] of its image, in the probe frame, float64
-    lever_mm: float  # typical distance of a pixel from there
-
-    @classmethod
-    def of(cls, probe: Probe) -> Motions:
-        positions = torch.from_numpy(pixel_positions_mm(probe, GRID, GRID))
-        middle = positions.mean(dim=0)
-        return cls(middle, float((positions - middle).square().sum(dim=1).mean().sqrt()))
-
-    def moved(self, poses: Tensor, steps: Tensor) -> Tensor:  # [..., 4, 4], [..., 6] mm -> [..., 4, 4]
-        return poses @ self.of_steps(steps)
-
-    def of_steps(self, steps: Tensor) -> Tensor:  # [..., 6] mm -> [..., 4, 4]
-        """In the probe frame: three shifts and three turns, about lateral, elevation and axial axis."""
-        shifts, turns = steps[..., :3], steps[..., 3:] / self.lever_mm
-        rotations = turned_by(turns.reshape(-1, 3)).reshape(*turns.shape[:-1], 3, 3)
-        motions = torch.zeros(*steps.shape[:-1], 4, 4, dtype=steps.dtype)
-        motions[..., :3, :3] = rotations
-        motions[..., :3, 3] = self.middle_mm - rotations @ self.middle_mm + shifts
-        motions[..., 3, 3] = 1.0
-        return motions
-
-    def step_between(self, before: Tensor, after: Tensor) -> tuple[float, float]:  # [4, 4] both
-        """How far the middle of the image moves, mm, and the image turns, degrees."""
-        middle = torch.cat([self.middle_mm, torch.ones(1, dtype=torch.float64)])
-        shift_mm = float(((after - before) @ middle).norm())
-        cosine = (float((before[:3, :3].T @ after[:3, :3]).trace()) - 1.0) / 2.0
-        return shift_mm, math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
-
-    def degrees(self, turns_mm: Tensor) -> Tensor:
-        return torch.rad2deg(turns_mm / self.lever_mm)
-
-
-# What of a frame is compared: its structures at some size, whatever gain and shadow made of their brightness.
-#
-# A frame is smoothed, its mean over a wider neighbourhood is taken off, and what is left is divided by its own
-# strength there. Coarse structures match from far away, fine ones tell the place exactly.
-
-NEIGHBOURHOOD = 3.0  # times as wide as the smoothing
-LEAST_STRENGTH = 0.02  # of grey values in [0, 1]: what varies less is noise
-REACH = 2.5  # standard deviations of a Gaussian that are summed
-LEAST_SIGMA = 0.3  # pixels: less smooths nothing
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Frames of `rows` x `columns` pixels, smoothed by Gaussians of `sigma_rows` and `sigma_columns` pixels."""
-
-    rows: int
-    columns: int
-    sigma_rows: float
-    sigma_columns: float
-
-    @classmethod
-    def of(cls, probe: Probe, rows: int, columns: int, smoothing_mm: float) -> Scale:
-        """Smoothed by so many mm along depth, and across in the middle of the image."""
-        middle = pixel_positions_mm(probe, rows, columns).reshape(rows, columns, 3)[rows // 2]
-        across_mm = float(((middle[1:] - middle[:-1]) ** 2).sum(axis=1).mean() ** 0.5)
-        return cls(rows, columns, smoothing_mm * rows / probe.scan_line_length_mm, smoothing_mm / across_mm)
-
-    def resized(self, image: Tensor) -> Tensor:  # [H, W] -> [rows, columns]
-        """A larger frame with the pixels of this scale: means of what they cover."""
-        return functional.interpolate(image[None, None], size=(self.rows, self.columns), mode="area")[0, 0]
-
-    def appearance(self, frames: Tensor) -> Tensor:  # [C, rows, columns] in [0, 1] -> [C, rows, columns]
-        """The structures of frames, of strength 1 where there are any."""
-        smooth = self._blurred(frames, 1.0)
-        structure = smooth - self._blurred(smooth, NEIGHBOURHOOD)
-        strength = self._blurred(structure.square(), NEIGHBOURHOOD)
-        return structure / (strength + LEAST_STRENGTH**2).sqrt()
-
-    def _blurred(self, frames: Tensor, times: float) -> Tensor:
-        rows = _smoother(self.rows, times * self.sigma_rows)
-        return rows @ frames @ _smoother(self.columns, times * self.sigma_columns).mT
-
-
-@lru_cache(maxsize=32)
-def _smoother(count: int, sigma: float) -> Tensor:  # [count, count]
-    """The matrix that smooths so many values by a Gaussian; beyond the ends the outermost values go on."""
-    if sigma < LEAST_SIGMA:
-        return torch.eye(count)
-    reach = max(1, math.ceil(REACH * sigma))
-    offsets = torch.arange(-reach, reach + 1)
-    weights = torch.exp(-0.5 * (offsets / sigma).square())
-    places = (torch.arange(count)[:, None] + offsets).clamp(0, count - 1)
-    return torch.zeros(count, count).scatter_add_(1, places, (weights / weights.sum()).expand(count, -1))
-
 
 # localize(): the pose at which a scene looks like a real frame, by Levenberg and Marquardt from coarse to fine.
 #
@@ -203,6 +70,7 @@ MIDDLE = Stage(64, 48, 1.5, 5, 0.6, 2)
 FINE = Stage(128, 96, 0.8, 4, 0.3, 4)
 LAST = Stage(128, 96, 0.5, 6, 0.2, 4)
 STAGES = (COARSE, MIDDLE, FINE, MIDDLE, FINE, LAST)
+TRACKING = (replace(MIDDLE, steps=2), replace(FINE, steps=2))  # from the frame before, in a tenth of the time
 MOST_BEGUN = 6  # poses at the coarse stage
 MOST_TRIED = 64  # poses that are looked at before, where the start is less certain
 START_DAMPING, MORE_DAMPING, LESS_DAMPING = 1e-2, 6.0, 3.0
@@ -214,11 +82,12 @@ SHORT_LAST_STEP = 0.02  # likewise, of the last stage
 def localize(
     scene: GaussianScene,
     image: Any,
-    start: Any,
+    start: Any = None,
     *,
     probe: Probe | None = None,
     within_mm: float = NEAR_MM,
     within_deg: float = NEAR_DEG,
+    search: SearchKind = SearchKind.NEAR,
     backend: str = "auto",
     limits: Limits = UNLIMITED,
 ) -> Localization:
@@ -227,23 +96,43 @@ def localize(
     `image` is grey values, an array or a tensor, uint8 or in [0, 1], in the layout of the scene's frames: rows along
     depth, columns across scan lines, not scan-converted. Its gain and contrast may differ from the scene's. `probe`
     took it (None: the one that the scene was trained with). The start may be off by `within_mm` and `within_deg`: more
-    than 3 mm and 5° costs more time.
+    than 3 mm and 5° costs more time. `search` track goes on from the pose of the frame before, a millimetre or two
+    away, in a tenth of the time; anywhere needs no start: an index of what the scene shows along its path is made for
+    the first frame, and kept with the scene.
     Raises InvalidArgument for an image that is none or smaller than 32 pixels a side, InvalidPose, InvalidProbe, and
     what render() raises.
     """
     frame = _checked_image(image)
-    LocalizationSettings(within_mm=within_mm, within_deg=within_deg)
-    told = check_poses(start, field="start")
-    if len(told) != 1:
-        raise InvalidArgument(f"start must be one pose, got {len(told)}", field="start")
-    first, at_rest = torch.from_numpy(scene.poses_at_rest(told)), scene.at_rest()
+    asked = LocalizationSettings(within_mm=within_mm, within_deg=within_deg, search=search)
     known = scene.info.probe_or(probe)
-    motions = Motions.of(known)
+    motions, rendered = Motions.of(known), _renderer(scene, known, backend, limits)
+    looked = _Search(frame, known, motions, rendered)
+    if asked.search is SearchKind.ANYWHERE:
+        index = scene.prepared(f"places of {known!r}", lambda: Places.of(scene, known, motions, rendered))
+        starts = first = index.nearest(frame)
+        poses = looked.begin(starts)
+    else:
+        first = torch.from_numpy(scene.poses_at_rest(_one_start(start)))
+        poses = (
+            first
+            if asked.search is SearchKind.TRACK
+            else looked.begin(_starts(first[0], motions, within_mm, within_deg))
+        )
+    stages = TRACKING if asked.search is SearchKind.TRACK else STAGES
+    for stage in stages:
+        poses = looked.improve(poses, stage)
+    found = looked.result(poses[0], first[0], stages[-1])
+    return replace(found, pose=scene.poses_as_tracked(found.pose[None])[0])
+
+
+def _renderer(scene: GaussianScene, probe: Probe, backend: str, limits: Limits) -> Rendered:
+    """Frames of the tissue at rest."""
+    at_rest = scene.at_rest()
 
     def rendered(poses: Tensor, rows: int, columns: int) -> Tensor:
         frames = render(
             at_rest,
-            known,
+            probe,
             poses.numpy(),
             height=rows,
             width=columns,
@@ -253,12 +142,162 @@ def localize(
         )
         return frames["bmode"].detach().cpu()
 
-    search = _Search(frame, known, motions, rendered)
-    poses = search.begin(_starts(first[0], motions, within_mm, within_deg))
-    for stage in STAGES:
-        poses = search.improve(poses, stage)
-    found = search.result(poses[0], first[0])
-    return replace(found, pose=scene.poses_as_tracked(found.pose[None])[0])
+    return rendered
+
+
+def _one_start(start: Any) -> FloatArray:  # [1, 4, 4]
+    if start is None:
+        raise InvalidPose("start is required, unless a frame is looked for anywhere", field="start")
+    told = check_poses(start, field="start")
+    if len(told) != 1:
+        raise InvalidArgument(f"start must be one pose, got {len(told)}", field="start")
+    return told
+
+
+class Tracker:
+    """Where each frame of a probe in motion was taken, from that of the frame before."""
+
+    def __init__(self, scene: GaussianScene, start: Any = None, *, probe: Probe | None = None) -> None:
+        """`start` [4, 4]: about where the first frame is taken, mm; None: anywhere. Raises InvalidPose."""
+        self._scene, self._probe = scene, probe
+        self._last = None if start is None else _one_start(start)[0]
+        self._motion: FloatArray | None = None  # [4, 4], from frame to frame; None: not known
+
+    def locate(self, image: Any) -> Localization:  # [H, W]
+        """The pose of the next frame, looked for where the motion of the last two leads, and about the last one where
+        it is not found there; anywhere after frames that were not found. Raises what localize() raises.
+        """
+        found = None
+        if self._last is not None:
+            if self._motion is not None:
+                found = self._localized(image, self._last @ self._motion, SearchKind.TRACK)
+            if found is None or not found.is_found:
+                found = self._localized(image, self._last, SearchKind.NEAR)
+        if found is None or not found.is_found:
+            found = self._localized(image, None, SearchKind.ANYWHERE)
+        if not found.is_found:
+            self._motion = None
+            return found
+        self._motion = np.eye(4) if self._last is None else np.linalg.inv(self._last) @ found.pose
+        self._last = found.pose
+        return found
+
+    def _localized(self, image: Any, start: FloatArray | None, search: SearchKind) -> Localization:
+        return localize(self._scene, image, start, probe=self._probe, search=search)
+
+
+# move_together(): one motion of all poses, by all their frames at once.
+#
+# Each frame tells its residuals r and their changes by the six numbers of its own motion, C. A small motion ξ of all
+# poses, about a point in their midst, is the motion J ξ of each, with J by the probe's axes: so A = Σ Jᵀ Cᵀ C J and
+# b = Σ Jᵀ Cᵀ r, and ξ = −A⁻¹ b. Directions that one frame cannot tell, as along a vessel, another does.
+
+TOGETHER = (MIDDLE, FINE, LAST)
+ROUNDS = 3  # of each stage
+
+
+def move_together(
+    scene: GaussianScene, images: Sequence[Any], poses: FloatArray, *, probe: Probe | None = None, backend: str = "auto"
+) -> FloatArray:  # [N, 4, 4] mm, in the frame of the sweep -> [4, 4]
+    """The rigid motion of all poses, applied from the left, after which the scene looks most like all the images.
+
+    Raises what localize() raises.
+    """
+    known = scene.info.probe_or(probe)
+    motions, rendered = Motions.of(known), _renderer(scene, known, backend, UNLIMITED)
+    searches = [_Search(_checked_image(image), known, motions, rendered) for image in images]
+    first = torch.from_numpy(poses)
+    middle = (first[:, :3, :3] @ motions.middle_mm + first[:, :3, 3]).mean(dim=0)
+    about = Motions(middle, motions.lever_mm)
+    whole = torch.eye(4, dtype=torch.float64)
+    for stage in TOGETHER:
+        tried = []
+        for _ in range(ROUNDS):
+            placed = whole @ first
+            at_rest = torch.from_numpy(scene.poses_at_rest(placed.numpy()))
+            fits = [one.linearised(pose[None], stage) for one, pose in zip(searches, at_rest, strict=True)]
+            left = torch.cat([fit.left[0] for fit in fits])
+            tried.append((float(left.square().mean()), whole))
+            jacobians = (_jacobian(about, motions, pose) for pose in placed)
+            changes = torch.cat([own.T @ fit.changes[0] for own, fit in zip(jacobians, fits, strict=True)], dim=1)
+            joint = _Fit(whole[None], left[None], changes[None], torch.zeros(1, dtype=torch.int64))
+            whole = about.of_steps(_step(joint, torch.tensor([START_DAMPING], dtype=torch.float64)))[0] @ whole
+        whole = min(tried, key=lambda one: one[0])[1]
+    return np.asarray(whole.numpy())
+
+
+def _jacobian(about: Motions, motions: Motions, pose: Tensor) -> Tensor:  # [4, 4] -> [6, 6]
+    """By the numbers of a small motion of a pose from the left, about a point of the scene, its own numbers."""
+    small = 1e-4 * torch.eye(6, dtype=torch.float64)
+    own = torch.linalg.inv(pose) @ about.of_steps(small) @ pose
+    turns = torch.from_numpy(turns_of(own[:, :3, :3].numpy()))
+    shifts = own[:, :3, 3] + own[:, :3, :3] @ motions.middle_mm - motions.middle_mm
+    return torch.cat([shifts, turns * motions.lever_mm], dim=1).T / 1e-4
+
+
+# Places: what a scene shows along the path of its sweep and around it, to find a frame of which nothing is known.
+#
+# Small frames are rendered at poses evenly around the training views, and described by their structures at the coarse
+# stage, of length 1: the scalar product with that of a frame is their correlation. The places that correlate best, not
+# too near to each other, are where the search begins.
+
+PATH_MM = 4.0  # between the views that places are around
+AROUND = 24  # places around each
+AROUND_MM, AROUND_DEG = (6.0, 2.0, 2.0), 10.0  # along lateral, elevation and axial axis
+MOST_PLACES = 4800
+DESCRIBED = Stage(32, 24, 3.0, 0, 1.0, 0)
+APART_MM, APART_DEG = 2.0, 4.0
+MOST_NEAREST = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Poses around the training views of a scene, and what it shows there to one probe."""
+
+    probe: Probe
+    motions: Motions
+    poses: Tensor  # [P, 4, 4], in tissue at rest
+    descriptors: Tensor  # [P, D], of length 1
+
+    @classmethod
+    def of(cls, scene: GaussianScene, probe: Probe, motions: Motions, rendered: Rendered) -> Places:
+        """Raises InvalidArgument where the scene holds no training poses."""
+        views = torch.from_numpy(scene.poses_at_rest(scene.training_poses))
+        if not len(views):
+            raise InvalidArgument(
+                "a frame is looked for along the sweep, and the scene holds no training poses", field="start"
+            )
+        along = [0]
+        for number in range(1, len(views)):
+            shift_mm, turn_deg = motions.step_between(views[along[-1]], views[number])
+            if shift_mm + 0.4 * turn_deg >= PATH_MM:
+                along.append(number)
+        chosen = views[along[:: max(1, math.ceil(len(along) * AROUND / MOST_PLACES))]]
+        even = SobolEngine(6, scramble=True, seed=SEED)  # type: ignore[no-untyped-call]
+        spread = 2.0 * even.draw(len(chosen) * AROUND, dtype=torch.float64) - 1.0
+        reach = torch.tensor([*AROUND_MM, *[math.radians(AROUND_DEG) * motions.lever_mm] * 3], dtype=torch.float64)
+        poses = motions.moved(chosen.repeat_interleave(AROUND, 0), spread * reach)
+        poses[::AROUND] = chosen
+        scale = Scale.of(probe, DESCRIBED.rows, DESCRIBED.columns, DESCRIBED.smoothing_mm)
+        parts = (rendered(part, scale.rows, scale.columns) for part in torch.split(poses, AROUND))
+        return cls(probe, motions, poses, torch.cat([_descriptors(scale, frames) for frames in parts]))
+
+    def nearest(self, frame: Tensor) -> Tensor:  # [H, W] -> [K, 4, 4]
+        """The poses whose frames look most like a frame, best first."""
+        scale = Scale.of(self.probe, DESCRIBED.rows, DESCRIBED.columns, DESCRIBED.smoothing_mm)
+        order = (self.descriptors @ _descriptors(scale, scale.resized(frame)[None])[0]).argsort(descending=True)
+        chosen: list[Tensor] = []
+        for pose in self.poses[order[: 4 * MOST_NEAREST]]:
+            apart = (self.motions.step_between(pose, other) for other in chosen)
+            if all(shift_mm > APART_MM or turn_deg > APART_DEG for shift_mm, turn_deg in apart):
+                chosen.append(pose)
+        return torch.stack(chosen[:MOST_NEAREST])
+
+
+def _descriptors(scale: Scale, frames: Tensor) -> Tensor:  # [C, rows, columns] -> [C, D]
+    structures = scale.appearance(frames).flatten(1)
+    centred = structures - structures.mean(dim=1, keepdim=True)
+    return functional.normalize(centred, dim=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,10 +367,12 @@ class _Search:
                 fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
         return fit.poses[fit.error.argsort(stable=True)[: stage.kept]]
 
-    def result(self, pose: Tensor, start: Tensor) -> Localization:
-        """What is told of the best pose, by the last stage; how certain it is, by frames of all motions."""
-        scale, target = self._at(LAST)
-        fit = self._linearised(pose[None], LAST, scale, target, slides=False)
+    def result(self, pose: Tensor, start: Tensor, stage: Stage) -> Localization:
+        """What is told of the best pose, by the last stage; how certain it is, by frames of all motions, unless in
+        haste.
+        """
+        scale, target = self._at(stage)
+        fit = self._linearised(pose[None], stage, scale, target, slides=stage is not LAST)
         similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
         deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
@@ -362,6 +403,9 @@ class _Search:
             frames = self._rendered(poses[new], rows, columns)
             self._known.update({keys[index]: frame for index, frame in zip(new, frames, strict=True)})
         return torch.stack([self._known[key] for key in keys])
+
+    def linearised(self, poses: Tensor, stage: Stage) -> _Fit:  # [K, 4, 4]
+        return self._linearised(poses, stage, *self._at(stage))
 
     def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
         """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""

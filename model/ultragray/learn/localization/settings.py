@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidProbe
@@ -10,6 +11,14 @@ from ultragray.geometry.probe import FloatArray, Probe
 
 NEAR_MM, NEAR_DEG = 3.0, 5.0
 MOST_MM, MOST_DEG = 20.0, 30.0
+
+
+class SearchKind(str, Enum):
+    """How much is known of where a frame was taken."""
+
+    NEAR = "near"
+    TRACK = "track"
+    ANYWHERE = "anywhere"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +31,12 @@ class LocalizationSettings(Contract):
     )
     within_deg: float = described(
         f"By which angle; more than {NEAR_DEG:g} costs more time.", NEAR_DEG, above=0.0, high=MOST_DEG
+    )
+    search: SearchKind = described(
+        "near: about the start. track: the start is the pose of the frame before, a millimetre or two away; a tenth of "
+        "the time. anywhere: nothing is known, and the start counts for nothing; the first search of a scene takes "
+        "seconds more.",
+        SearchKind.NEAR,
     )
 
 

@@ -106,10 +106,11 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     """Where in the scene a real frame was taken, looked for about `start`."""
     body = await read_json_body(request, LocalizeBody, LARGE_IMAGE)
     deadline = service.planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
-    search = LocalizationSettings(probe=body.probe, within_mm=body.within_mm, within_deg=body.within_deg)
+    known = {item.name: getattr(body, item.name) for item in fields(LocalizationSettings)}
     image = await asyncio.to_thread(_bytes_of, body.image)
-    sought = sought_frame(image, body.image_height, body.image_width, search)
-    work = locate(service.rendering, scene, sought, body.start.exact("start"), deadline, body.registration)
+    sought = sought_frame(image, body.image_height, body.image_width, LocalizationSettings(**known))
+    start = None if body.start is None else body.start.exact("start")
+    work = locate(service.rendering, scene, sought, start, deadline, body.registration)
     return await finish_or_abandon(work, request.receive, deadline)
 
 

@@ -9,7 +9,10 @@ import torch
 from ultragray import ConvexProbe, LinearProbe, localize, render
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
-from ultragray.learn.localization.search import Motions, _deviations, places_after, slid
+from ultragray.learn.localization import search
+from ultragray.learn.localization.appearance import Motions, places_after, slid
+from ultragray.learn.localization.search import Tracker, _deviations
+from ultragray.learn.localization.settings import SearchKind
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import demo_poses, load_demo_scene
@@ -90,6 +93,39 @@ def test_a_less_certain_start_is_looked_around_in(demo):
     start = displaced(pose, probe, 8.0, 12.0, 2)
     found = localize(demo, frame_of(demo, pose), start, within_mm=9.0, within_deg=13.0)
     assert is_found(found.pose, pose, probe)
+
+
+def test_frames_of_a_probe_in_motion_are_tracked(demo, monkeypatch):
+    """Each from the frame before, by fewer frames than a search; and a tracker that lost its place finds it again."""
+    probe, views = demo.info.probe_or(None), demo.training_poses[100:105]
+    asked = []
+    monkeypatch.setattr(search, "localize", lambda *a, **k: asked.append(k["search"]) or localize(*a, **k))
+    tracker = Tracker(demo, views[0])
+    assert all(is_found(tracker.locate(frame_of(demo, pose)).pose, pose, probe) for pose in views)
+    assert asked == [SearchKind.NEAR] + [SearchKind.TRACK] * 4
+    elsewhere = demo.training_poses[20]
+    again_mm, _ = distance(tracker.locate(frame_of(demo, elsewhere)).pose, elsewhere, probe)
+    assert again_mm < 3.0 < distance(views[-1], elsewhere, probe)[0] / 5.0
+    assert asked[5:] == [SearchKind.TRACK, SearchKind.NEAR, SearchKind.ANYWHERE]
+
+
+def test_a_frame_is_found_from_nowhere(demo):
+    """Beside the path: none of the poses of the index is the frame's."""
+    probe = demo.info.probe_or(None)
+    for seed, number in enumerate((15, 190)):
+        pose = displaced(demo.training_poses[number], probe, 3.0, 4.0, seed)
+        found = localize(demo, frame_of(demo, pose), search=SearchKind.ANYWHERE)
+        assert found.is_found
+        assert is_found(found.pose, pose, probe), number
+
+
+def test_a_start_is_needed_unless_a_frame_is_looked_for_anywhere(demo, random_scene):
+    with pytest.raises(InvalidPose, match="start is required"):
+        localize(demo, BLACK, search="track")
+    with pytest.raises(InvalidArgument, match="the scene holds no training poses"):
+        localize(random_scene(50, info={"probe": PHANTOM_PROBE}), BLACK, search="anywhere")
+    with pytest.raises(InvalidArgument, match="search must be one of near, track, anywhere, got 'here'"):
+        localize(demo, BLACK, HERE, search="here")
 
 
 def test_another_image_is_not_found(demo):

@@ -1,0 +1,153 @@
+"""What a search compares: frames by their structures, after motions of the probe.
+
+What a motion within its image plane does to a frame, by the frame alone: its pixels slide.
+
+Shadows and gain slide along, which they would not quite do in a frame rendered there. To tell the next step of a search
+that is near enough, and it takes no rendering.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ultragray.geometry.probe import Probe
+from ultragray.learn.sweep import pixel_positions_mm
+from ultragray.learn.training.poses import turned_by
+
+IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
+
+
+def places_after(probe: Probe, motions: Tensor, rows: int, columns: int) -> Tensor:
+    """Where in a frame [rows, columns] the pixels of frames after motions [S, 4, 4] lie: [S, rows, columns, 2].
+
+    The two numbers are column and row in [-1, 1], as functional.grid_sample() takes them.
+    """
+    pixels = pixel_positions_mm(probe, rows, columns)
+    moves = motions.numpy()
+    moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]
+    depth, across = (share.reshape(rows, columns) for share in probe.lines.coordinates(pixels[:, 0], pixels[:, 2]))
+    rows_after, columns_after = probe.lines.coordinates(moved[..., 0], moved[..., 2])
+    places = np.stack(
+        [
+            2.0 * (columns_after - across[0, 0]) / (across[0, -1] - across[0, 0]) - 1.0,
+            2.0 * (rows_after - depth[0, 0]) / (depth[-1, 0] - depth[0, 0]) - 1.0,
+        ],
+        axis=-1,
+    )
+    return torch.from_numpy(places.reshape(len(motions), rows, columns, 2)).float()
+
+
+def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -> [K, S, H, W]
+    """Each frame after each step, by places_after(); what comes in from outside is as the edge was."""
+    count, rows, columns = frames.shape
+    repeated = frames[:, None].expand(count, len(places), rows, columns).reshape(-1, 1, rows, columns)
+    grid = places.repeat(count, 1, 1, 1)
+    after = functional.grid_sample(repeated, grid, mode="bicubic", padding_mode="border", align_corners=True)
+    return after.reshape(count, len(places), rows, columns)
+
+
+# Small motions of the probe: shifts along its own axes and turns about the middle of its image, all in mm.
+#
+# A turn is given by the way that it moves a point at the typical distance from the middle, so that steps of all six
+# numbers weigh alike.
+
+GRID = 16  # rows and columns of the image that are looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Motions of one probe."""
+
+    middle_mm: Tensor  # [3] of its image, in the probe frame, float64
+    lever_mm: float  # typical distance of a pixel from there
+
+    @classmethod
+    def of(cls, probe: Probe) -> Motions:
+        positions = torch.from_numpy(pixel_positions_mm(probe, GRID, GRID))
+        middle = positions.mean(dim=0)
+        return cls(middle, float((positions - middle).square().sum(dim=1).mean().sqrt()))
+
+    def moved(self, poses: Tensor, steps: Tensor) -> Tensor:  # [..., 4, 4], [..., 6] mm -> [..., 4, 4]
+        return poses @ self.of_steps(steps)
+
+    def of_steps(self, steps: Tensor) -> Tensor:  # [..., 6] mm -> [..., 4, 4]
+        """In the probe frame: three shifts and three turns, about lateral, elevation and axial axis."""
+        shifts, turns = steps[..., :3], steps[..., 3:] / self.lever_mm
+        rotations = turned_by(turns.reshape(-1, 3)).reshape(*turns.shape[:-1], 3, 3)
+        motions = torch.zeros(*steps.shape[:-1], 4, 4, dtype=steps.dtype)
+        motions[..., :3, :3] = rotations
+        motions[..., :3, 3] = self.middle_mm - rotations @ self.middle_mm + shifts
+        motions[..., 3, 3] = 1.0
+        return motions
+
+    def step_between(self, before: Tensor, after: Tensor) -> tuple[float, float]:  # [4, 4] both
+        """How far the middle of the image moves, mm, and the image turns, degrees."""
+        middle = torch.cat([self.middle_mm, torch.ones(1, dtype=torch.float64)])
+        shift_mm = float(((after - before) @ middle).norm())
+        cosine = (float((before[:3, :3].T @ after[:3, :3]).trace()) - 1.0) / 2.0
+        return shift_mm, math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+    def degrees(self, turns_mm: Tensor) -> Tensor:
+        return torch.rad2deg(turns_mm / self.lever_mm)
+
+
+# What of a frame is compared: its structures at some size, whatever gain and shadow made of their brightness.
+#
+# A frame is smoothed, its mean over a wider neighbourhood is taken off, and what is left is divided by its own
+# strength there. Coarse structures match from far away, fine ones tell the place exactly.
+
+NEIGHBOURHOOD = 3.0  # times as wide as the smoothing
+LEAST_STRENGTH = 0.02  # of grey values in [0, 1]: what varies less is noise
+REACH = 2.5  # standard deviations of a Gaussian that are summed
+LEAST_SIGMA = 0.3  # pixels: less smooths nothing
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Frames of `rows` x `columns` pixels, smoothed by Gaussians of `sigma_rows` and `sigma_columns` pixels."""
+
+    rows: int
+    columns: int
+    sigma_rows: float
+    sigma_columns: float
+
+    @classmethod
+    def of(cls, probe: Probe, rows: int, columns: int, smoothing_mm: float) -> Scale:
+        """Smoothed by so many mm along depth, and across in the middle of the image."""
+        middle = pixel_positions_mm(probe, rows, columns).reshape(rows, columns, 3)[rows // 2]
+        across_mm = float(((middle[1:] - middle[:-1]) ** 2).sum(axis=1).mean() ** 0.5)
+        return cls(rows, columns, smoothing_mm * rows / probe.scan_line_length_mm, smoothing_mm / across_mm)
+
+    def resized(self, image: Tensor) -> Tensor:  # [H, W] -> [rows, columns]
+        """A larger frame with the pixels of this scale: means of what they cover."""
+        return functional.interpolate(image[None, None], size=(self.rows, self.columns), mode="area")[0, 0]
+
+    def appearance(self, frames: Tensor) -> Tensor:  # [C, rows, columns] in [0, 1] -> [C, rows, columns]
+        """The structures of frames, of strength 1 where there are any."""
+        smooth = self._blurred(frames, 1.0)
+        structure = smooth - self._blurred(smooth, NEIGHBOURHOOD)
+        strength = self._blurred(structure.square(), NEIGHBOURHOOD)
+        return structure / (strength + LEAST_STRENGTH**2).sqrt()
+
+    def _blurred(self, frames: Tensor, times: float) -> Tensor:
+        rows = _smoother(self.rows, times * self.sigma_rows)
+        return rows @ frames @ _smoother(self.columns, times * self.sigma_columns).mT
+
+
+@lru_cache(maxsize=32)
+def _smoother(count: int, sigma: float) -> Tensor:  # [count, count]
+    """The matrix that smooths so many values by a Gaussian; beyond the ends the outermost values go on."""
+    if sigma < LEAST_SIGMA:
+        return torch.eye(count)
+    reach = max(1, math.ceil(REACH * sigma))
+    offsets = torch.arange(-reach, reach + 1)
+    weights = torch.exp(-0.5 * (offsets / sigma).square())
+    places = (torch.arange(count)[:, None] + offsets).clamp(0, count - 1)
+    return torch.zeros(count, count).scatter_add_(1, places, (weights / weights.sum()).expand(count, -1))
