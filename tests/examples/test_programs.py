@@ -192,10 +192,15 @@ def test_it_comes_nearer_to_the_plane(plane):
         ("augment_pytorch", "--frames 24 --batch-size 8 --workers 0", ["bmode [8, 1, 256, 256], pose", "24 frames"]),
         ("augment_pytorch", "--frames 24 --batch-size 8 --workers 2", ["bmode [8, 1, 256, 256], pose", "24 frames"]),
         ("standard_plane", "--episodes 1 --start-mm 2 --start-deg 2", ["similarity", "of 1 reached the plane"]),
+        (
+            "scan_policy",
+            "--steps 2 --starts 2 --min-confidence 0.5",
+            ["learned in", "of 2 starts reached", "confidence"],
+        ),
     ],
 )
 def test_as_a_program(demo_service, example, options, told):
-    address = [] if example == "standard_plane" else ["--address", demo_service.grpc]
+    address = [] if example in ("standard_plane", "scan_policy") else ["--address", demo_service.grpc]
     command = [sys.executable, EXAMPLES / f"{example}.py", *address, *options.split()]
     printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout
     assert [words for words in told if words not in printed] == []
