@@ -16,21 +16,22 @@ export class Arrival {
   #ended = false;
   #wake: () => void = () => undefined;
 
-  constructor(stream: ReadableStream<Uint8Array>) {
+  private constructor(stream: ReadableStream<Uint8Array>) {
     this.#reading = this.#read(stream.getReader());
-    this.#reading.catch(() => undefined); // `more` tells it
+    this.#reading.catch(() => undefined); // `next` tells it
   }
 
-  /** Waits for another part, or for the end of a file that has none; false where all was taken. Throws where no more comes. */
-  async more(): Promise<boolean> {
+  static async of(address: string | URL): Promise<Arrival> {
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
+    return new Arrival(answer.body!);
+  }
+
+  /** What has arrived once another part is there: up to its end; or all, where it is the last one, or no other comes. */
+  async next(): Promise<[bytes: Uint8Array, extent: Extent]> {
     while (!this.#ended && this.#reached() === this.#taken) {
       await Promise.race([new Promise<void>((resolve) => (this.#wake = resolve)), this.#reading]);
     }
-    return this.share < 1;
-  }
-
-  /** What has arrived since: up to the end of a part; or all, where that is the last one, or no other comes. */
-  take(): [bytes: Uint8Array, extent: Extent] {
     const [reached, all] = [this.#reached(), this.#ends?.at(-1) ?? 0];
     const isPart = reached > this.#taken && reached < all;
     this.#taken = reached > this.#taken ? reached : this.#size;

@@ -17,6 +17,7 @@ interface Exports {
   ultragray_gaussians(scene: number, count: number): number;
   ultragray_harmonics(scene: number): number;
   ultragray_plan_of(view: number, pose: number, plan: number): number;
+  ultragray_draw(view: number, pose: number, first: number, end: number, planes: number): number;
   ultragray_finish(view: number, pose: number, planes: number, threads: number, pixels: number, extrapolation: number): number;
   ultragray_problem(): number;
 }
@@ -54,6 +55,13 @@ export interface Plan {
   height: number;
   width: number;
   planes: boolean[];
+}
+
+/** Some scan lines of the planes of a pose, from `first` to before `end`, and how many numbers that are. */
+export interface Lines {
+  first: number;
+  end: number;
+  floats: number;
 }
 
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
@@ -136,6 +144,15 @@ export class Library {
       const [fanned, wrap] = next(2).map(Boolean) as [boolean, boolean];
       const [height, width] = next(2) as [number, number];
       return { axes, origin, near, row, most, start, pitch: span / width, beam, fanned, wrap, height, width, planes: numbers.map(Boolean) };
+    });
+  }
+
+  /** [H, end - first] of each plane that the plan wants, one after another. */
+  draw(view: number, pose: readonly number[], { first, end, floats }: Lines): Float32Array<ArrayBuffer> {
+    return this.#room(POSE_BYTES + 4 * floats, (at) => {
+      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
+      if (this.exports.ultragray_draw(view, at, first, end, at + POSE_BYTES) !== 0) this.#fail();
+      return new Float32Array(this.exports.memory.buffer as ArrayBuffer, at + POSE_BYTES, floats).slice();
     });
   }
 

@@ -4,7 +4,8 @@ import type { components } from "./generated/openapi.js";
 import type { Pose } from "./pose.js";
 import { Arrival } from "./arrival.js";
 import type { Extent } from "./library.js";
-import type { Answer, Drawn, Loaded, RendererChoice, RendererName, Request } from "./worker.js";
+import { compiled, Thread } from "./thread.js";
+import type { Drawn, Loaded, RendererChoice, RendererName } from "./worker.js";
 
 type Schemas = components["schemas"];
 
@@ -85,6 +86,8 @@ export interface Scene {
   readonly whole: Promise<void>;
   /** What drew the newest frame, or will draw the first. */
   readonly renderer: RendererName | "service";
+  /** How many workers of this page drew the newest frame. */
+  readonly workers: number;
   /** The frame of a pose. Throws, in a sentence, for a pose or settings that cannot be. */
   render(pose: Pose, settings?: Settings): Promise<Frame>;
   close(): void;
@@ -104,33 +107,33 @@ const MOST_VIEWS = 4; // settings that are kept ready
 
 class LocalScene implements Scene {
   readonly whole = Promise.resolve();
+  workers = 0;
   #views = new Map<string, Promise<{ view: number; info: FrameInfo }>>();
+  #number = 0; // of the newest view
 
   constructor(
-    private readonly worker: Renderer,
-    private readonly scene: number,
+    private readonly thread: Thread,
     readonly info: SceneInfo,
     public renderer: RendererName,
   ) {}
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
     const { view, info } = await this.#view(JSON.stringify(settings));
-    const frame = await this.worker.ask<Drawn>({ act: "render", view, pose: checked(pose) });
-    this.renderer = frame.renderer;
+    const frame = await this.thread.ask<Drawn>({ act: "render", view, pose: checked(pose) });
+    [this.renderer, this.workers] = [frame.renderer, frame.workers];
     const figures = FIGURES.map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
     return new Frame(info, frame.pixels, Object.fromEntries(figures) as Extrapolation);
   }
 
   close(): void {
-    this.worker.close();
+    this.thread.close();
   }
 
   #view(settings: string): Promise<{ view: number; info: FrameInfo }> {
     let kept = this.#views.get(settings);
     if (kept === undefined) {
-      kept = this.worker
-        .ask<{ view: number; info: string }>({ act: "prepare", scene: this.scene, settings })
-        .then(({ view, info }) => ({ view, info: JSON.parse(info) as FrameInfo }));
+      const view = ++this.#number;
+      kept = this.thread.ask<string>({ act: "prepare", view, settings }).then((info) => ({ view, info: JSON.parse(info) as FrameInfo }));
       kept.catch(() => this.#views.delete(settings)); // the next one is told again what is wrong
     }
     this.#views.delete(settings);
@@ -138,44 +141,9 @@ class LocalScene implements Scene {
     for (const [oldest, view] of this.#views) {
       if (this.#views.size <= MOST_VIEWS) break;
       this.#views.delete(oldest);
-      void view.then(({ view }) => this.worker.ask({ act: "freeView", view }));
+      void view.then(({ view }) => this.thread.ask({ act: "freeView", view }));
     }
     return kept;
-  }
-}
-
-/** The worker that renders one scene; its memory goes with it. */
-class Renderer {
-  #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
-  #number = 0;
-  #asked = new Map<number, { resolve: (result: unknown) => void; reject: (error: Error) => void }>();
-
-  constructor() {
-    this.#worker.onmessage = ({ data: { number, result, problem } }: MessageEvent<Answer>) => {
-      const asked = this.#asked.get(number);
-      this.#asked.delete(number);
-      if (problem === undefined) asked?.resolve(result);
-      else asked?.reject(new Error(problem));
-    };
-    this.#worker.onerror = ({ message }) => this.#end(new Error(`the renderer does not start: ${message}`));
-  }
-
-  ask<Result>(request: Request): Promise<Result> {
-    return new Promise((resolve, reject) => {
-      this.#number += 1;
-      this.#asked.set(this.#number, { resolve: resolve as (result: unknown) => void, reject });
-      this.#worker.postMessage({ number: this.#number, request });
-    });
-  }
-
-  close(): void {
-    this.#worker.terminate();
-    this.#end(new Error("the scene is closed"));
-  }
-
-  #end(error: Error): void {
-    for (const { reject } of this.#asked.values()) reject(error);
-    this.#asked.clear();
   }
 }
 
@@ -188,7 +156,7 @@ class ArrivingScene implements Scene {
     private now: Scene,
     arrival: Arrival,
     progress: (share: number) => void,
-    private readonly choice: RendererChoice,
+    private readonly drawing: Drawing,
   ) {
     this.whole = this.#refine(arrival, progress);
     this.whole.catch(() => undefined); // for those who do not ask for it
@@ -200,6 +168,10 @@ class ArrivingScene implements Scene {
 
   get renderer(): Scene["renderer"] {
     return this.now.renderer;
+  }
+
+  get workers(): number {
+    return this.now.workers;
   }
 
   async render(pose: Pose, settings?: Settings): Promise<Frame> {
@@ -219,8 +191,8 @@ class ArrivingScene implements Scene {
 
   async #refine(arrival: Arrival, progress: (share: number) => void): Promise<void> {
     progress(arrival.share);
-    while (await arrival.more()) {
-      const finer = await opened(...arrival.take(), this.choice);
+    while (arrival.share < 1) {
+      const finer = await opened(await arrival.next(), this.drawing);
       if (this.#closed) return finer.close();
       const coarser = this.now;
       this.now = finer;
@@ -238,6 +210,7 @@ const LATENCIES = 32; // whose median is expected of the next frame
 class ServedScene implements Scene {
   readonly whole = Promise.resolve();
   readonly renderer = "service";
+  readonly workers = 0;
   #socket: Promise<WebSocket> | undefined;
   #sequence = 0;
   #waiting = new Map<number, Waiting>();
@@ -325,28 +298,37 @@ function checked(pose: Pose): number[] {
   return [...pose];
 }
 
-async function opened(bytes: Uint8Array, extent: Extent, renderer: RendererChoice): Promise<Scene> {
-  const worker = new Renderer();
+async function opened(part: Part | Promise<Part>, drawing: Drawing): Promise<Scene> {
+  const [thread, module] = [new Thread(), compiled()]; // while the part arrives
   try {
-    const loaded = await worker.ask<Loaded>({ act: "load", bytes, extent, renderer });
+    const [bytes, extent] = await part;
+    const loaded = await thread.ask<Loaded>({ act: "load", module: await module, bytes, extent, ...drawing });
     const told = JSON.parse(loaded.info) as SceneInfo;
     told.label_names ??= {}; // a file without labels says nothing of them
-    return new LocalScene(worker, loaded.scene, told, loaded.renderer);
+    return new LocalScene(thread, told, loaded.renderer);
   } catch (error) {
-    worker.close();
+    thread.close();
     throw error;
   }
 }
 
-export interface LoadOptions {
-  progress?: (share: number) => void;
-  renderer?: RendererChoice;
+type Part = [bytes: Uint8Array, extent: Extent];
+
+interface Drawing {
+  renderer: RendererChoice;
+  workers: number;
 }
 
 export interface ConnectOptions {
   key?: string;
   seenAfter_ms?: number;
 }
+
+export interface LoadOptions extends Partial<Drawing> {
+  progress?: (share: number) => void;
+}
+
+const MOST_WORKERS = 4; // unless more are asked for: each finds anew what the plane cuts
 
 export const Scene = {
   /** A scene file, of an address or of its bytes, whose frames are rendered here. Throws, in a sentence, for what is none.
@@ -356,16 +338,20 @@ export const Scene = {
    *
    * `renderer`: what draws, WebAssembly or WebGPU; `auto`, WebGPU where the browser has a GPU that suffices for the scene.
    * A device that is lost leaves its frames to WebAssembly.
+   *
+   * `workers`: how many draw one frame of WebAssembly, each with a copy of the scene; they start with the first frame of
+   * more than 64 scan lines. Without it, one for each core, up to four.
    */
-  async load(source: string | URL | Uint8Array, { progress = () => undefined, renderer = "auto" }: LoadOptions = {}): Promise<Scene> {
+  async load(source: string | URL | Uint8Array, options: LoadOptions = {}): Promise<Scene> {
+    const { progress = () => undefined, renderer = "auto", workers = Math.min(navigator.hardwareConcurrency, MOST_WORKERS) } = options;
     if (!RENDERERS.includes(renderer)) throw new Error(`renderer must be one of ${RENDERERS.join(", ")}, got ${renderer}`);
-    if (source instanceof Uint8Array) return opened(source, "whole", renderer);
-    const answer = await fetch(source);
-    if (!answer.ok) throw new Error(`${answer.url} cannot be fetched: ${answer.status} ${answer.statusText}`);
-    const arrival = new Arrival(answer.body!);
-    await arrival.more();
-    const scene = await opened(...arrival.take(), renderer);
-    return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress, renderer) : scene;
+    if (!Number.isInteger(workers) || workers < 1) throw new Error(`workers must be a whole number of at least 1, got ${workers}`);
+    const drawing = { renderer, workers };
+    if (source instanceof Uint8Array) return opened([source, "whole"], drawing);
+    const arriving = Arrival.of(source);
+    const scene = await opened(arriving.then((arrival) => arrival.next()), drawing);
+    const arrival = await arriving;
+    return arrival.share < 1 ? new ArrivingScene(scene, arrival, progress, drawing) : scene;
   },
 
   /** A scene of a service, such as `http://localhost:8000`, whose frames are streamed.

@@ -1,73 +1,95 @@
 /** Renders in a thread of its own, so that the page never waits. It answers each request with its number. */
 
-import { GpuRenderer } from "./gpu/renderer.js";
-import { Library, type Extent, type Rendered } from "./library.js";
+import { Crew } from "./crew.js";
+import type { GpuRenderer } from "./gpu/renderer.js";
+import { Library, type Extent, type Lines, type Rendered } from "./library.js";
 
 /** What draws: WebGPU or WebAssembly; `auto`, the former where the browser has a GPU that suffices. */
 export type RendererName = "wasm" | "webgpu";
 export type RendererChoice = "auto" | RendererName;
+/** The scene of this worker, of a whole file or of the beginning of one. */
+export type LoadRequest = { act: "load"; module: WebAssembly.Module; bytes: Uint8Array; extent: Extent; renderer: RendererChoice; workers: number };
+/** Views have numbers that who asks for them chooses. */
 export type Request =
-  | { act: "load"; bytes: Uint8Array; extent: Extent; renderer: RendererChoice }
-  | { act: "prepare"; scene: number; settings: string }
+  | LoadRequest
+  | { act: "prepare"; view: number; settings: string }
   | { act: "render"; view: number; pose: readonly number[] }
+  | ({ act: "draw"; view: number; pose: readonly number[] } & Lines)
   | { act: "freeView"; view: number };
 export type Answer = { number: number; result?: unknown; problem?: string };
-export type Loaded = { scene: number; info: string; renderer: RendererName };
-export type Drawn = Rendered & { renderer: RendererName };
+export type Loaded = { info: string; renderer: RendererName };
+export type Drawn = Rendered & { renderer: RendererName; workers: number };
 
-let library: Promise<Library> | undefined;
+let library: Library;
+let scene: number;
 let gpu: GpuRenderer | undefined;
+let crew: Crew | undefined; // of more than this worker
+const views = new Map<number, number>(); // in the library
 let drawn: Promise<unknown> = Promise.resolve(); // when all frames that were asked for are there
 
-async function open(): Promise<Library> {
-  const answer = await fetch(new URL("ultragray.wasm", import.meta.url));
-  if (!answer.ok) throw new Error(`the renderer, ${answer.url}, cannot be fetched: ${answer.status}`);
-  return Library.of(await WebAssembly.compile(await answer.arrayBuffer()));
-}
-
-async function load(opened: Library, { bytes, extent, renderer }: Extract<Request, { act: "load" }>): Promise<Loaded> {
-  const loaded = opened.load(bytes, extent);
-  if (renderer !== "wasm") {
+async function load(request: LoadRequest): Promise<Loaded> {
+  library = await Library.of(request.module);
+  const loaded = library.load(request.bytes, request.extent);
+  scene = loaded.scene;
+  const isWhole = request.extent === "whole";
+  if (request.renderer === "webgpu" || (request.renderer === "auto" && isWhole)) {
     try {
-      gpu = await GpuRenderer.open(opened, loaded.scene, { software: renderer === "webgpu" });
+      const { GpuRenderer } = await import("./gpu/renderer.js"); // so that first frames do not wait for it
+      gpu = await GpuRenderer.open(library, scene, { software: request.renderer === "webgpu" });
     } catch (error) {
-      if (renderer === "webgpu") throw error;
+      if (request.renderer === "webgpu") throw error;
     }
   }
-  return { ...loaded, renderer: gpu === undefined ? "wasm" : "webgpu" };
+  if (request.workers > 1 && isWhole) crew = new Crew(library, { ...request, renderer: "wasm" });
+  return { info: loaded.info, renderer: gpu === undefined ? "wasm" : "webgpu" };
 }
 
-/** A frame, and what drew it: where the GPU fails, as for a device that was lost, WebAssembly draws, or says what is wrong. */
-async function render(opened: Library, view: number, pose: readonly number[]): Promise<Drawn> {
-  if (gpu !== undefined) {
-    try {
-      const frame = await gpu.render(view, opened.plan(view, pose), (planes) => opened.finish(view, pose, planes));
-      return { ...frame, renderer: "webgpu" };
-    } catch {
-      if (gpu?.isLost) gpu = undefined;
-    }
+function prepare(view: number, settings: string): string {
+  const prepared = library.prepare(scene, settings);
+  views.set(view, prepared.view);
+  crew?.prepare(view, settings);
+  return prepared.info;
+}
+
+/** A frame, and what drew it: where the GPU or the crew fails, as for a device that was lost, this worker draws, or says what is wrong. */
+async function render(view: number, pose: readonly number[]): Promise<Drawn> {
+  const at = views.get(view)!;
+  try {
+    if (gpu !== undefined) return { ...(await gpu.render(view, library.plan(at, pose), (planes) => library.finish(at, pose, planes))), renderer: "webgpu", workers: 1 };
+  } catch {
+    if (gpu?.isLost) gpu = undefined;
   }
-  return { ...opened.render(view, pose), renderer: "wasm" };
+  const together = await crew?.render(view, at, pose).catch(() => undefined);
+  return { renderer: "wasm", workers: 1, ...(together ?? library.render(at, pose)) };
+}
+
+async function freeView(view: number): Promise<void> {
+  await drawn; // some may be its own
+  await gpu?.freeView(view);
+  crew?.freeView(view);
+  library.freeView(views.get(view)!);
+  views.delete(view);
 }
 
 async function done(request: Request, transfer: Transferable[]): Promise<unknown> {
-  library ??= open();
-  const opened = await library;
   switch (request.act) {
     case "load":
-      return load(opened, request);
+      return load(request);
     case "prepare":
-      return opened.prepare(request.scene, request.settings);
+      return prepare(request.view, request.settings);
     case "render": {
-      const frame = render(opened, request.view, request.pose);
+      const frame = render(request.view, request.pose);
       drawn = Promise.allSettled([drawn, frame]).then(() => undefined); // else each would keep all frames before it
       transfer.push((await frame).pixels.buffer);
       return frame;
     }
+    case "draw": {
+      const planes = library.draw(views.get(request.view)!, request.pose, request);
+      transfer.push(planes.buffer);
+      return planes;
+    }
     case "freeView":
-      await drawn; // some may be its own
-      await gpu?.freeView(request.view);
-      return opened.freeView(request.view);
+      return freeView(request.view);
   }
 }
 

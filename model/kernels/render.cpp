@@ -14,7 +14,6 @@
 namespace ultragray {
 namespace {
 
-constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
 constexpr int64_t kClustersPerTask = 128;
 constexpr int kPosesAtOnce = 8;                    // bounds the memory that slices take
 constexpr int64_t kPixelsBetweenChecks = 1 << 21;  // of the flag that ends a rendering: at most some 10 ms
@@ -102,7 +101,9 @@ class Batch {
 
     // `first` is the number of the first pose, for errors. Throws GivenUp, TooCostly.
     void render(const Outputs& outputs, const std::vector<SavedPlanes>& saved, int threads, const Limits& limits = {},
-                int first = 0) {
+                int first = 0, const Lines& drawn = {}) {
+        const int first_strip = drawn.first / kStripLines, end = std::min(drawn.end, views_[0].lines);
+        const int strips = (end + kStripLines - 1) / kStripLines - first_strip;
         Phase slicing{count() * parts(), [&](int task) { slice(task, limits); }};
         Phase checking{count(), [&](int c) {
                            const auto& most = limits.footprint_pixels;
@@ -110,9 +111,9 @@ class Batch {
                            const int64_t pixels = sum(c, footprint_pixels);
                            if (pixels > most) throw TooCostly(first + c, pixels);
                        }};
-        Phase drawing{count() * strips(), [&](int task) {
-                          const int c = task / strips();
-                          draw(c, task % strips() * kStripLines, outputs, saved.empty() ? SavedPlanes{} : saved[c], limits);
+        Phase drawing{count() * strips, [&](int task) {
+                          const int c = task / strips, line = (first_strip + task % strips) * kStripLines;
+                          draw(c, line, outputs, saved.empty() ? SavedPlanes{} : saved[c], limits);
                       }};
         run_phases({&slicing, &checking, &drawing}, threads);
     }
@@ -269,12 +270,13 @@ std::vector<std::string> instruction_sets() {
 }
 
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits) {
+            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits,
+            const Lines& drawn) {
     const Kernels& kernels = choose_kernels(instruction_set);
     const int64_t frame_size = int64_t(height) * width;
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
-        batch.render(outputs.from(first, frame_size), {}, threads, limits, first);
+        batch.render(outputs.from(first, frame_size), {}, threads, limits, first, drawn);
     }
 }
 

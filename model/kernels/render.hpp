@@ -1,6 +1,7 @@
 // Frames of many poses on many threads.
 #pragma once
 
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -20,11 +21,18 @@ struct ProbeGeometry {
     bool uncut = false;  // Gaussians count wherever their means lie
 };
 
+// The scan lines that are drawn, of whole strips; the others' pixels are left as they are.
+struct Lines {
+    int first = 0, end = std::numeric_limits<int>::max();
+};
+inline constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
+
 // Renders C poses [4, 4] (row-major, cm, probe to scene; columns 0 and 2 may be those of a plane that is sheared such that
 // its parallel lines run along z). The result does not depend on the number of threads.
 // Throws GivenUp, TooCostly, std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits);
+            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits,
+            const Lines& drawn = {});
 
 // The cost of each pose [C] in footprint pixels (footprint.hpp), without drawing it. Throws GivenUp, std::bad_alloc.
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,

@@ -181,15 +181,32 @@ void View::render(const double* poses, size_t count, int threads, void* pixels, 
         Extrapolation found{};
         if (judged) found = judged_by_pose(sight);
         Planes planes = wanted_planes(judged);
-        const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
-        if (at(planes.bmode) || at(planes.echo) || at(planes.transmittance) || at(planes.coverage))
-            ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
-                              {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr,
-                               nullptr, nullptr, nullptr, 0.0f},
-                              {});
+        draw(sight, {}, threads, planes);
         finish(sight, planes, threads, judged ? &found : nullptr, out + c * frame_bytes());
         if (extrapolations) extrapolations[c] = found;
     }
+}
+
+void View::draw(const Sight& sight, const Lines& lines, int threads, Planes& planes) const {
+    const auto at = [](std::vector<float>& plane) { return plane.empty() ? nullptr : plane.data(); };
+    if (!at(planes.bmode) && !at(planes.echo) && !at(planes.transmittance) && !at(planes.coverage)) return;
+    ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
+                      {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr, nullptr,
+                       nullptr, nullptr, 0.0f},
+                      {}, lines);
+}
+
+void View::draw(const double* pose, int first_line, int end_line, float* drawn) const {
+    const bool ends_a_strip = end_line % kStripLines == 0 || end_line == width_;
+    if (first_line < 0 || first_line % kStripLines != 0 || !ends_a_strip || first_line >= end_line || end_line > width_)
+        throw Fault("scan lines must be some of " + std::to_string(width_) + ", from one multiple of " +
+                    std::to_string(kStripLines) + " to another or to the last, got " + std::to_string(first_line) + " to " +
+                    std::to_string(end_line));
+    Planes planes = wanted_planes(true);
+    draw(sight_of(Pose::read(pose, "pose"), "pose"), {first_line, end_line}, 1, planes);
+    for (const std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage})
+        for (size_t at = first_line; at < plane->size(); at += width_)
+            drawn = std::copy_n(&(*plane)[at], end_line - first_line, drawn);
 }
 
 ultragray_plan View::plan(const double* pose) const {

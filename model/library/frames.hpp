@@ -57,9 +57,10 @@ class View {
     // Frames of poses [C, 4, 4], mm, row by row, and how far each extrapolates [C], where that is not null. Throws Fault,
     // std::bad_alloc.
     void render(const double* poses, size_t count, int threads, void* pixels, Extrapolation* extrapolations) const;
-    // The two halves of a frame whose planes are drawn elsewhere: what they are drawn by, and what follows from them, [H, W]
-    // each, those that the plan wants one after another. Throws Fault, std::bad_alloc.
+    // The parts of a frame whose planes are drawn elsewhere, or in shares: what they are drawn by, some scan lines of them,
+    // and what follows from them, [H, W] each, those that the plan wants one after another. Throws Fault, std::bad_alloc.
     ultragray_plan plan(const double* pose) const;
+    void draw(const double* pose, int first_line, int end_line, float* planes) const;
     Extrapolation finish(const double* pose, const float* planes, int threads, void* pixels) const;
 
  private:
@@ -70,6 +71,7 @@ class View {
     };
     Sight sight_of(const Pose& pose, const std::string& name) const;
     Planes wanted_planes(bool judged) const;
+    void draw(const Sight& sight, const Lines& lines, int threads, Planes& planes) const;
     // From planes to pixels. What the pose alone tells of its extrapolation is completed; null: nobody wants to know.
     void finish(const Sight& sight, Planes& drawn, int threads, Extrapolation* judged, unsigned char* pixels) const;
     Extrapolation judged_by_pose(const Sight& sight) const;

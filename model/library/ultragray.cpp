@@ -90,6 +90,14 @@ int ultragray_plan_of(const ultragray_view* view, const double* pose, ultragray_
     });
 }
 
+int ultragray_draw(const ultragray_view* view, const double* pose, int first, int end, float* planes) {
+    return guarded(1, [&] {
+        if (view == nullptr || pose == nullptr || planes == nullptr) throw Fault("view, pose and planes must be given");
+        view->view.draw(pose, first, end, planes);
+        return 0;
+    });
+}
+
 int ultragray_finish(const ultragray_view* view, const double* pose, const float* planes, int threads, void* pixels,
                      ultragray_extrapolation* extrapolation) {
     return guarded(1, [&] {

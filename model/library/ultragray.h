@@ -81,6 +81,9 @@ typedef struct ultragray_plan {
 
 /* What the planes of a pose [4, 4] are drawn by. Returns 0, or another number where it failed. */
 ULTRAGRAY_API int ultragray_plan_of(const ultragray_view *view, const double *pose, ultragray_plan *plan);
+/* Scan lines of these planes, from `first` to before `end`, each a multiple of 64 or the width: [height, end - first] of each
+ * plane that the plan wants, one after another. Several together are the planes, to the bit. */
+ULTRAGRAY_API int ultragray_draw(const ultragray_view *view, const double *pose, int first, int end, float *planes);
 /* As ultragray_render, of one pose and the planes [height, width] that its plan wants, one after another. */
 ULTRAGRAY_API int ultragray_finish(const ultragray_view *view, const double *pose, const float *planes, int threads,
                                    void *pixels, ultragray_extrapolation *extrapolation);

@@ -1,19 +1,18 @@
 /** The memory of a page that renders: what its process has, what waits for the garbage collector, and the renderer's own. */
 
-import { readFileSync } from "node:fs";
+import { appendFileSync, readFileSync } from "node:fs";
+import path from "node:path";
 
-/** Has the workers of the page tell the renderer's memory; before the page is opened. */
-export async function watchRenderer(page) {
-  await page.route("**/worker.js", async (route) => {
-    const answer = await route.fetch();
-    const watched = `const instantiate = WebAssembly.instantiate;
+/** Has the workers of the pages in a folder tell the renderer's memory. */
+export function watchRenderer(folder) {
+  const watched = `
+const instantiate = WebAssembly.instantiate;
 WebAssembly.instantiate = async (...given) => {
   const instance = await instantiate(...given);
   globalThis.rendererMemory = instance.exports.memory;
   return instance;
 };`;
-    await route.fulfill({ response: answer, body: `${await answer.text()}\n${watched}` });
-  });
+  appendFileSync(path.join(folder, "worker.js"), watched);
 }
 
 export class Memory {

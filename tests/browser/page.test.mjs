@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { once } from "node:events";
 import http from "node:http";
-import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
+import { appendFileSync, cpSync, mkdirSync, readFileSync, renameSync, writeFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 
@@ -61,6 +61,79 @@ test("random frames in Firefox are those of the reference", { skip: missing ?? f
   } finally {
     await firefox.close();
   }
+});
+
+/** Frames of one worker and of several, by settings: how many drew each, and whether both are the same to the bit. */
+async function drawnTogether(folder) {
+  const { Scene } = await import(`${folder}/index.js`);
+  const [one, several] = await Promise.all([1, 3].map((workers) => Scene.load("dragged.ugr", { renderer: "wasm", workers })));
+  const { poses } = await (await fetch("page.json")).json();
+  const needle = { kind: "needle", frame: "probe", tip_mm: [8, 0.3, 30], hub_mm: [-20, 0, 5] };
+  const outputs = ["bmode", "echo", "transmittance", "coverage", "attenuation", "labels"];
+  const settings = [
+    { height: 70, width: 300, encoding: "float32", outputs },
+    { height: 90, width: 192, probe: { kind: "radial", near_mm: 2, far_mm: 40 }, ghost: 0.5 },
+    { height: 90, width: 200, contact: "pressure", speckle: "natural", tools: [needle], display: { pixel_mm: 0.5 } },
+    { height: 50, width: 65 },
+    { height: 50, width: 64 },
+  ];
+  const told = [];
+  for (const wanted of settings) {
+    for (let k = 0; k < 1000 && told.length === 0 && several.workers < 3; k++) await several.render(poses[0], wanted); // until all have started
+    for (const pose of [poses[3], poses[12]]) {
+      const [alone, together] = await Promise.all([one, several].map((scene) => scene.render(pose, wanted)));
+      const same = alone.bytes.every((value, at) => value === together.bytes[at]) && JSON.stringify(alone.extrapolation) === JSON.stringify(together.extrapolation);
+      told.push([one.workers, several.workers, same && alone.bytes.some((value) => value > 0)]);
+    }
+  }
+  const many = await Promise.all(poses.slice(0, 20).map((pose, at) => several.render(pose, settings[at % 5]))); // of more settings than are kept ready
+  const refused = await several.render(poses[0], { height: 70, width: 300, min_confidence: 1 }).catch(({ message }) => message);
+  for (const scene of [one, several]) scene.close();
+  return { told, sizes: many.map(({ info }) => info.width), refused };
+}
+
+const TOGETHER = [3, 3, 3, 3, 3, 3, 2, 2, 1, 1].map((several) => [1, several, true]);
+
+test("a frame that several workers draw is that of one, to the bit", async () => {
+  const page = await browser.newPage();
+  await page.goto(`${url}page.json`); // nothing renders there
+  const { told, sizes, refused } = await page.evaluate(drawnTogether, url.slice(0, -1));
+  assert.deepEqual(told, TOGETHER);
+  assert.equal(sizes.length, 20);
+  assert.match(refused, /has a confidence of 0\.\d\d, 1 is asked for/);
+  await page.close();
+});
+
+test("several workers draw in Firefox, too", { skip: missing ?? false }, async () => {
+  const firefox = await launchFirefox();
+  try {
+    const page = await firefox.newPage();
+    page.setDefaultTimeout(TIMEOUT_MS);
+    await page.goto(url);
+    assert.deepEqual((await page.evaluate(drawnTogether, ".")).told, TOGETHER);
+  } finally {
+    await firefox.close();
+  }
+});
+
+test("a worker that fails costs no frame: the first one draws alone", async () => {
+  cpSync(site.folder, `${site.folder}-failing`, { recursive: true });
+  const fails = `;const given = onmessage;
+    onmessage = (event) => event.data.request.act === "draw" ? postMessage({ number: event.data.number, problem: "the memory does not suffice" }) : given(event);`;
+  appendFileSync(path.join(`${site.folder}-failing`, "worker.js"), fails);
+  renameSync(`${site.folder}-failing`, path.join(site.folder, "failing"));
+  const page = await browser.newPage();
+  await page.goto(`${url}page.json`);
+  const drawn = await page.evaluate(async (folder) => {
+    const { Scene } = await import(`${folder}/index.js`);
+    const scene = await Scene.load("demo.ugr", { renderer: "wasm", workers: 2 });
+    const { poses } = await (await fetch("page.json")).json();
+    const seen = [];
+    for (let k = 0; k < 60; k++) seen.push((await scene.render(poses[k % poses.length], { height: 20, width: 128 })).pixels().some((value) => value > 0), scene.workers === 1);
+    return seen.every(Boolean);
+  }, `${url}failing`);
+  assert.ok(drawn);
+  await page.close();
 });
 
 test("the page goes on without a network, is steered by keys, and keeps its policy", async () => {
@@ -282,7 +355,7 @@ test("a scene file that is damaged or cut off is one error in words, and the pag
 test("memory comes back after many scenes, and frames take none for good", async () => {
   const context = await browser.newContext();
   const page = await context.newPage();
-  await watchRenderer(page);
+  watchRenderer(site.folder);
   await page.goto(`${url}index.js`); // a page without an element that renders
   const memory = await Memory.of(browser, page);
   const load = (count) =>

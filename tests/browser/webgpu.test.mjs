@@ -76,7 +76,7 @@ test("a lost device costs no frame: WebAssembly draws those on their way, and th
 test("without an adapter, or with one in software, WebAssembly draws unless WebGPU is asked for", async (t) => {
   const load = async (renderer) => {
     const { Scene } = await import("./index.js");
-    return Scene.load("scene.ugz", { renderer }).then(({ renderer }) => renderer, ({ message }) => message);
+    return Scene.load("scene.ugz", { renderer }).then((scene) => scene.whole.then(() => scene.renderer), ({ message }) => message);
   };
   const loaded = async (one, renderer) => {
     const page = await one.newPage();

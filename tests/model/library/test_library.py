@@ -127,6 +127,7 @@ def library():
         ("gaussians", ctypes.POINTER(ctypes.c_float), (pointer, ctypes.POINTER(size))),
         ("harmonics", ctypes.POINTER(ctypes.c_float), (pointer,)),
         ("plan_of", ctypes.c_int, (pointer, pointer, ctypes.POINTER(Plan))),
+        ("draw", ctypes.c_int, (pointer, pointer, ctypes.c_int, ctypes.c_int, pointer)),
         ("finish", ctypes.c_int, (pointer, pointer, pointer, ctypes.c_int, pointer, pointer)),
         ("problem", text, ()),
     ):
@@ -263,6 +264,24 @@ def test_planes_drawn_by_a_plan_become_the_frame(scene, python_scene, settings):
     assert code == 0, scene.problem
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(told, extrapolation)
+
+
+@pytest.mark.parametrize("probe", ["L7-4", "C5-2", {"kind": "radial", "near_mm": 2, "far_mm": 40}])
+def test_scan_lines_drawn_in_shares_are_the_planes_to_the_bit(scene, python_scene, probe):
+    height, width = 70, 150
+    settings = {"probe": probe, "height": height, "width": width, "outputs": list(PLANES), "encoding": "float32"}
+    poses = poses_beside(python_scene, 1)
+    _, whole, _ = scene.render(settings, poses)
+    view = scene.library.ultragray_prepare(scene.pointer, json.dumps(settings).encode())
+    shares = []
+    for first, end in ((0, 64), (64, 128), (128, width)):
+        planes = np.empty((len(PLANES), height, end - first), np.float32)
+        assert scene.library.ultragray_draw(view, poses.ctypes.data, first, end, planes.ctypes.data) == 0
+        shares.append(planes)
+    np.testing.assert_array_equal(np.concatenate(shares, axis=2).ravel(), whole.view(np.float32).ravel())
+    assert scene.library.ultragray_draw(view, poses.ctypes.data, 64, 130, planes.ctypes.data) != 0
+    assert scene.problem.endswith("from one multiple of 64 to another or to the last, got 64 to 130")
+    scene.library.ultragray_free_view(view)
 
 
 def test_the_geometry_of_a_plan_is_the_pose_and_the_probe(scene, python_scene):
