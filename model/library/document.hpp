@@ -161,12 +161,22 @@ class Fields {
             if (!found) object_.fail(item.key(), "is not a known key: " + title_ + " takes " + joined(known_));
         }
     }
-    const Value& object() const { return object_; }
 
  private:
     Value object_;
     std::string title_;
     std::vector<std::string> known_;
 };
+
+// A structure of the contract: its fields, no others, and what they mean together (checks.cpp).
+template <class Structure>
+Structure read_object(const Value& object) {
+    Structure it;
+    Fields fields(object, Structure::title);
+    it.read(fields);
+    fields.end();
+    check(it, object);
+    return it;
+}
 
 }  // namespace ultragray::library

@@ -63,7 +63,7 @@ void check_local(const RenderSettings& settings, const SceneInfo& info) {
 RenderSettings settings_of(const std::string& text, const SceneInfo& info) {
     const Json document = Json::parse(text.empty() ? "{}" : text, nullptr, false);
     if (document.is_discarded()) throw Fault("the settings are no JSON");
-    RenderSettings settings = RenderSettings::read(Value(document, ""));
+    RenderSettings settings = read_object<RenderSettings>(Value(document, ""));
     std::vector<std::string> once;
     for (const std::string& output : settings.outputs)
         if (std::find(once.begin(), once.end(), output) == once.end()) once.push_back(output);

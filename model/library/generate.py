@@ -1,8 +1,8 @@
 """Writes contract.hpp, the settings of frames and what they hold as C++ structures: `python model/library/generate.py`.
 
-A dataclass becomes a structure of the same fields, with its defaults and a `read` that checks each by its limits; a
-family becomes a variant, so that a member without its case does not compile. What fields mean together is checked by
-`check`, by hand (checks.hpp).
+A dataclass becomes a structure of the same fields, with its defaults and a `read` that checks each by its limits
+(`read_object` of document.hpp reads the whole); a family becomes a variant, so that a member without its case does not
+compile. What fields mean together is checked by `check`, by hand (checks.cpp).
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _structure(cls: Any) -> str:
         declared.append(f"    {whole} {item.name}{_default(kind, default, optional)};")
         how = "require" if item.default is MISSING and item.default_factory is MISSING else "read"
         value = _reading(kind, item)
-        read.append(f'    fields.{how}("{item.name}", [&](const Value& value) {{ it.{item.name} = {value}; }});')
+        read.append(f'        fields.{how}("{item.name}", [&](const Value& value) {{ {item.name} = {value}; }});')
     title = f"the {_family(cls)} {cls.kind}" if _family(cls) else cls.__name__
     fixed = [
         f"    static constexpr double {name} = {getattr(cls, name)};"
@@ -90,19 +90,14 @@ def _structure(cls: Any) -> str:
     ]
     lines = [
         f"struct {cls.__name__} {{",
-        *declared,
+        f'    static constexpr const char* title = "{title}";',
         *fixed,
-        f"    static {cls.__name__} read(const Value& value);",
-        "};",
-        f"void check(const {cls.__name__}& it, const Value& value);  // checks.cpp",
-        f"inline {cls.__name__} {cls.__name__}::read(const Value& object) {{",
-        f"    {cls.__name__} it;",
-        f'    Fields fields(object, "{title}");',
+        *declared,
+        "    void read(Fields& fields) {",
         *read,
-        "    fields.end();",
-        "    check(it, object);",
-        "    return it;",
-        "}",
+        "    }",
+        "};",
+        f"void check(const {cls.__name__}& it, const Value& value);",
         "",
     ]
     return "\n".join(lines)
@@ -116,7 +111,7 @@ def _family(cls: Any) -> str | None:
 def _variant(cls: Any) -> str:
     names = [member.__name__ for member in cls.members.values()]
     kinds = ", ".join(f'"{kind}"' for kind in cls.members)
-    cases = [f"        case {place}: return {name}::read(value);" for place, name in enumerate(names[:-1])]
+    cases = [f"        case {place}: return read_object<{name}>(value);" for place, name in enumerate(names[:-1])]
     lines = [
         f"using {cls.__name__} = std::variant<{', '.join(names)}>;",
         f"inline {cls.__name__} read_{cls.__name__}(const Value& value) {{",
@@ -125,7 +120,7 @@ def _variant(cls: Any) -> str:
         f'        value.refuse("an object with a kind, one of {", ".join(cls.members)}");',
         f'    switch (value.at("kind").word({{{kinds}}})) {{',
         *cases,
-        f"        default: return {names[-1]}::read(value);",
+        f"        default: return read_object<{names[-1]}>(value);",
         "    }",
         "}",
         "",
@@ -192,7 +187,7 @@ def _element(kind: Any) -> str:
         return "value.text()"
     if issubclass(kind, Enum) or (issubclass(kind, Family) and Family in kind.__bases__):
         return f"read_{kind.__name__}(value)"
-    return f"{kind.__name__}::read(value)"
+    return f"read_object<{kind.__name__}>(value)"
 
 
 if __name__ == "__main__":

@@ -202,8 +202,8 @@ SceneInfo info_of(const std::string& text) {
         info.intensity = whole.at("intensity").word({"released", "sigmoid"}) ? Intensity::Sigmoid : Intensity::Released;
     if (given("sh_degree")) info.sh_degree = int(whole.at("sh_degree").integer({0.0, 3.0, {}}));
     if (given("gaussian_count")) info.gaussian_count = whole.at("gaussian_count").integer({0.0, 1e9, {}});
-    if (given("beam")) info.beam = ElevationBeam::read(whole.at("beam"));
-    if (given("speckle")) info.speckle = SpeckleModel::read(whole.at("speckle"));
+    if (given("beam")) info.beam = read_object<ElevationBeam>(whole.at("beam"));
+    if (given("speckle")) info.speckle = read_object<SpeckleModel>(whole.at("speckle"));
     if (given("confidence") && !document["confidence"].empty())
         info.confidence = ConfidenceModel::read(whole.at("confidence"));
     if (given("tissue_shares")) info.tissue_shares = whole.at("tissue_shares").vector<3>({0.0, 1.0, {}});
