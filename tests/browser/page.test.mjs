@@ -191,6 +191,33 @@ test("on a phone the image is true to scale, and a finger moves the probe", asyn
   await page.close();
 });
 
+test("a gamepad's sticks move the probe, but not within their dead zone", async () => {
+  const page = await browser.newPage();
+  await page.addInitScript(() => (navigator.getGamepads = () => [null, { axes: globalThis.sticks ?? [0.1, -0.1, 0.14, 0] }]));
+  await page.goto(url);
+  await shown(page);
+  const { still, way, turned } = await page.evaluate(async () => {
+    const probe = document.querySelector("ultragray-probe");
+    const frames = async (count) => {
+      for (let k = 0; k < count; k++) await new Promise(requestAnimationFrame);
+    };
+    const before = probe.pose;
+    await frames(5);
+    const still = probe.pose === before;
+    globalThis.sticks = [1, 0, 0, 0];
+    await frames(5);
+    globalThis.sticks = [0, 0, 0, 1];
+    const moved = probe.pose;
+    await frames(5);
+    const way = [3, 7, 11].map((at) => moved[at] - before[at]);
+    const along = [0, 4, 8].reduce((sum, at, row) => sum + before[at] * way[row], 0);
+    return { still, way: [along, Math.hypot(...way)], turned: [5, 6, 9, 10].some((at) => Math.abs(probe.pose[at] - before[at]) > 1e-3) };
+  });
+  assert.ok(still && turned);
+  assert.ok(way[0] > 0.4 && Math.abs(way[0] - way[1]) < 1e-9, `${way} mm along its lateral axis and in all`);
+  await page.close();
+});
+
 test("what is wrong is said in a sentence", async () => {
   const page = await browser.newPage();
   await page.goto(url);
@@ -214,20 +241,22 @@ test("what is wrong is said in a sentence", async () => {
   await page.close();
 });
 
-/** Hands out the site, and of slow.ugz its beginning at once, the rest after a request for /rest; cut.ugz and damaged.ugz are what they are called. */
+/** Hands out the site; of slow.ugz and damaged.ugz the beginning at once, the rest after a request for /rest, and of cut.ugz no more. */
 async function slowServer() {
   const whole = readFileSync(path.join(site.folder, "scene.ugz"));
   const damaged = Buffer.from(whole);
   damaged[whole.length - 100] ^= 1;
   const beginning = Math.floor(whole.length / 2); // within the third of four parts
-  let hold;
+  let rest;
   const types = { html: "text/html", css: "text/css", js: "text/javascript", json: "application/json", wasm: "application/wasm" };
   const slow = http.createServer((request, response) => {
     const name = request.url.slice(1) || "index.html";
-    if (name === "rest") hold?.end(whole.subarray(beginning));
-    if (name === "slow.ugz") (hold = response).writeHead(200).write(whole.subarray(0, beginning));
-    else if (name === "cut.ugz") response.end(whole.subarray(0, beginning));
-    else if (name === "damaged.ugz") response.end(damaged);
+    const held = { "slow.ugz": whole, "damaged.ugz": damaged }[name];
+    if (name === "rest") rest?.();
+    if (held !== undefined) {
+      response.writeHead(200).write(held.subarray(0, beginning));
+      rest = () => response.end(held.subarray(beginning));
+    } else if (name === "cut.ugz") response.end(whole.subarray(0, beginning));
     else response.writeHead(200, { "Content-Type": types[name.split(".").at(-1)] ?? "text/plain" }).end(name === "rest" ? "" : readFileSync(path.join(site.folder, name)));
   });
   slow.listen(0, "127.0.0.1");
@@ -257,6 +286,7 @@ test("a compressed scene is rendered while it arrives, coarse first", async () =
       const fine = await pixels(scene);
       const told = async (address) => {
         const scene = await Scene.load(address);
+        await fetch("rest");
         const problem = await scene.whole.then(() => "nothing", (error) => error.message);
         return [problem, (await pixels(scene)).length];
       };
