@@ -49,7 +49,7 @@ def main() -> None:
     document["rows"] = [
         {
             "scene": name,
-            "gaussians": scenes[name].gaussian_count,
+            "gaussians": len(scenes[name].means),
             "side": side,
             "environments": count,
             "steps_per_s": float(np.median([STEPS / wall_s for wall_s, _ in rounds[name, side, count]])),

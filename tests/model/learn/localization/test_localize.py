@@ -103,9 +103,10 @@ def test_frames_of_a_probe_in_motion_are_tracked(demo, monkeypatch):
     tracker = Tracker(demo, views[0])
     assert all(is_found(tracker.locate(frame_of(demo, pose)).pose, pose, probe) for pose in views)
     assert asked == [SearchKind.NEAR] + [SearchKind.TRACK] * 4
-    elsewhere = demo.training_poses[20]
+    elsewhere = max(demo.training_poses, key=lambda pose: distance(views[-1], pose, probe)[0])
     again_mm, _ = distance(tracker.locate(frame_of(demo, elsewhere)).pose, elsewhere, probe)
-    assert again_mm < 3.0 < distance(views[-1], elsewhere, probe)[0] / 5.0
+    assert again_mm < 3.0
+    assert distance(views[-1], elsewhere, probe)[0] > 15.0
     assert asked[5:] == [SearchKind.TRACK, SearchKind.NEAR, SearchKind.ANYWHERE]
 
 
