@@ -246,9 +246,11 @@ def jobs(measured: Document) -> Lines:
 def frames_in_a_page(measured: Document) -> Lines:
     """Frames that Chromium renders itself."""
     memory, size = measured["memory_mib"], "{side}x{side} in the page, one core"
+    shared, faster = "{side}x{side} by {workers} workers", "{together_ms:g} ms: {faster:g} times as fast"
     timed = "{browser_ms:g} ms, {frames_per_s:.0f} frames/s: {ratio:g} times the native 128 bits' {native_ms:g} ms"
     rows = [
         *((size.format_map(one), timed.format_map(one)) for one in measured["sizes"]),
+        *((shared.format_map(one), faster.format_map(one)) for one in measured["sizes"] if "workers" in one),
         ("First frame after the page was opened", f"{measured['first_frame_ms'] / 1000:.2f} s"),
         (
             f"Memory of the page after {measured['frames_for_growth']:,} more frames",
