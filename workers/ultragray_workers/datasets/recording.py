@@ -130,10 +130,6 @@ class Recordings:
         """Raises DatasetNotFound."""
         return self._header(name).settings
 
-    def id(self, name: str) -> str:
-        """Tells a recording from an earlier one of its name. Raises DatasetNotFound."""
-        return self._header(name).id
-
     def writer(self, name: str) -> RecordingWriter:
         """Raises DatasetNotFound."""
         return RecordingWriter(self.storage, name, self._header(name))
