@@ -183,7 +183,8 @@ def told(measured: Document) -> Lines:
         ("of both merged; joined without a fit, dB", f"{db['merged']:.2f}; {db['joined']:.2f}"),
         ("of one scene trained on both, dB", f"{db['both']:.2f}"),
     ]
-    for share, one in thinned.items():
+    for share in map(str, SHARES):
+        one = thinned[share]
         what = f"PSNR with {float(share):.0%} of the Gaussians; of as many at random, dB"
         rows.append((what, f"{one['chosen']:.1f}; {one['random']:.1f}"))
     return columns([{"what": what, "found": found} for what, found in rows], {"Measured": "{what}", "": "{found}"})
