@@ -10,6 +10,7 @@ from importlib.util import find_spec
 import cv2
 import h5py
 import numpy as np
+import pyarrow.parquet
 import pydicom
 import pytest
 import zarr
@@ -135,9 +136,6 @@ def test_tar_loads_with_the_standard_library(tmp_path):
 
 
 def test_parquet_is_a_data_set_of_hugging_face(tmp_path):
-    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
-    import pyarrow.parquet
-
     expected = export(tmp_path / "frames.parquet", "parquet", header(dtype="uint8"))
     table = pyarrow.parquet.read_table(tmp_path / "frames.parquet")
     told = {name.decode(): json.loads(text) for name, text in table.schema.metadata.items()}

@@ -6,9 +6,11 @@ import base64
 import json
 from dataclasses import replace
 
+import nibabel
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, RadialProbe, SceneInfo, render
 from ultragray.errors import InvalidArgument
@@ -237,8 +239,6 @@ def test_gaussians_are_relabelled_by_a_brush_and_cut_by_their_label(scene):
 
 
 def test_meshes_and_label_maps_are_shapes(scene, tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    nibabel = pytest.importorskip("nibabel")
     ball = trimesh.creation.icosphere(3, 5.0)
     ball.apply_translation(MIDDLE)
     ball.export(tmp_path / "ball.stl")
