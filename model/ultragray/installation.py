@@ -25,6 +25,7 @@ MODULES_OF_EXTRAS = {
     "dicom": ("pydicom", "PIL"),
     "hdf5": ("h5py",),
     "mcap": ("mcap", "mcap_ros2"),
+    "mesh": ("trimesh",),
     "nifti": ("nibabel",),
     "parquet": ("pyarrow",),
     "ray": ("ray",),

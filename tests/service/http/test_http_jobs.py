@@ -166,7 +166,7 @@ def test_each_kind_has_a_documented_specification():
         assert model.__name__ == f"{kind.title()}Specification"
         schema = TypeAdapter(model).json_schema()
         assert set(schema["properties"]) == {field.name for field in fields(taken)} - {"kind"}
-        assert set(schema["required"]) == {"dataset", "scene"} & set(schema["properties"])
+        assert set(schema["required"]) == {"dataset", "recording", "scene"} & set(schema["properties"])
 
 
 def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(start_service, tmp_path):

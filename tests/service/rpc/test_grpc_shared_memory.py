@@ -82,8 +82,13 @@ class ClientSocket:
         self._end.settimeout(60)
         self._received = self._end.makefile("rb")
 
+    def announce(self, size):
+        """How many bytes the next message has."""
+        self._end.sendall(size.to_bytes(4, "little"))
+
     def send(self, data):
-        self._end.sendall(len(data).to_bytes(4, "little") + data)
+        self.announce(len(data))
+        self._end.sendall(data)
 
     def ask(self, sequence, **fields):
         self.send(rendering_pb2.RenderStreamRequest(sequence=sequence, **fields).SerializeToString())
@@ -132,8 +137,8 @@ def test_what_is_no_message_is_told_and_too_large_a_one_ends_the_poses(talk):
     through.send(b"\xff" * 10)
     assert "not a message" in through.receive().error.detail
     assert through.ask(2, pose=moved(0)).sequence == 2
-    through.send(b"\0" * (MAX_MESSAGE_BYTES + 1))
-    assert "at most 65536 bytes, got 65537" in through.receive().error.detail
+    through.announce(MAX_MESSAGE_BYTES + 1)
+    assert f"at most {MAX_MESSAGE_BYTES} bytes, got {MAX_MESSAGE_BYTES + 1}" in through.receive().error.detail
     assert through.receive() is None
     assert call.code() == grpc.StatusCode.OK
 

@@ -67,9 +67,8 @@ async def add_frame(request: Request, service: ServiceDep, dataset: DatasetName)
         raise UnsupportedMediaType(
             f"Content-Type must be {FRAME_TYPE}, got {content_type[:200]!r}", field="Content-Type"
         )
-    frame = read_incoming_frame(await request.body())
     async with service.recordings.stream(dataset) as stream:
-        await stream.put(frame)
+        await stream.put(read_incoming_frame(await request.body()))
         return await stream.stored()
 
 
