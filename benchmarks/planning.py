@@ -117,7 +117,7 @@ def planned_and_even(runs: Document) -> Lines:
     names = {"overlapping": "even, lanes overlapping by half", "side by side": "even, lanes side by side"}
     names |= {"half": "even, lanes side by side", "planned": "planned"}
     rows = []
-    for way, words in names.items():
+    for way, words in names.items() if seeds else ():
         figures = {key: np.array([run[way][key] for run in seeds]) for key in ("psnr_db", "ms_ssim", "coverage")}
         own = np.array([run["planned"]["psnr_db"] for run in seeds])
         rows.append(
