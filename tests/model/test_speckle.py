@@ -274,3 +274,14 @@ def test_frames_without_texture_have_no_speckle_to_find():
     images[:, 0, 0] = 128  # a frame may not be constant
     sweep = Sweep(images, poses, LINEAR, np.arange(len(poses)), "smooth")
     assert fit_speckle(scene, sweep, backend="cpu") is None
+
+
+def test_frames_too_far_apart_to_share_speckle_tell_that_within_a_frame_alone():
+    poses = np.stack([pose_at(y=20.0 * number) for number in range(6)])
+    scene = grey_scene()
+    grey = render(scene, None, poses, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"]
+    images = (kernel_speckle(MODEL, AXES, LINEAR, poses, grey).numpy() * 255.0).round().astype(np.uint8)
+    sweep = Sweep(images, poses, LINEAR, np.arange(len(poses)), "sparse")
+    found = fit_speckle(scene, sweep, backend="cpu")
+    assert found is not None
+    np.testing.assert_allclose(found.axial_mm, MODEL.axial_mm, rtol=0.3)
