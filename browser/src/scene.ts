@@ -82,7 +82,7 @@ export class Frame {
 export interface Scene {
   /** What the scene says of itself: probe, size of its images, labels … */
   readonly info: SceneInfo;
-  /** When frames are those of the whole file. Rejects, in a sentence, where the rest of it is damaged, or does not come. */
+  /** When frames are those of the whole file. Rejects, in a sentence, where the rest of it is damaged, does not come, or is too large for the GPU. */
   readonly whole: Promise<void>;
   /** What drew the newest frame, or will draw the first. */
   readonly renderer: RendererName | "service";
