@@ -54,9 +54,7 @@ def localize(
     ],
     start: Annotated[
         Path | None,
-        option(
-            "A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown="needed, unless anywhere"
-        ),
+        option("A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown="needed, unless anywhere"),
     ] = None,
     within_mm: Annotated[float, option("How far the start may be off.")] = 3.0,
     within_deg: Annotated[float, option("By which angle.")] = 5.0,
