@@ -176,10 +176,10 @@ def test_the_agent_takes_back_what_did_not_help(plane):
 
 @pytest.mark.slow
 def test_it_comes_nearer_to_the_plane(plane):
-    env = gymnasium.make(STANDARD_PLANE, scene=DEMO_FILE, height=64, width=64, start_mm=4.0, start_deg=4.0)
+    env = gymnasium.make(STANDARD_PLANE, scene=DEMO_FILE, height=64, width=64, start_mm=6.0, start_deg=6.0)
     episodes = [plane.scan(env, seed) for seed in (2, 3, 5)]
     first, last = (np.mean([getattr(one, when)["similarity"] for one in episodes]) for when in ("first", "last"))
-    assert last > first + 0.1
+    assert last > first + 0.2
     off = [[getattr(one, when)["distance_mm"] for one in episodes] for when in ("first", "last")]
     assert np.mean(off[1]) < np.mean(off[0])
 
