@@ -10,10 +10,9 @@ import re
 from bisect import bisect_right
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from contextvars import copy_context
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -101,7 +100,6 @@ class ScenePlaces(Collector):
         )
 
 
-T = TypeVar("T")
 
 _FOLDERS = re.compile(r"^/.*/(?=[^/]+\.ugr\b)", re.DOTALL)
 DEFAULT_PAGE_SIZE = 100
@@ -128,12 +126,12 @@ class SceneCatalog:
         """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
-            return cached[1] if cached is not None else await _fetched(self._store.header, name)
+            return cached[1] if cached is not None else await in_own_thread(partial(self._store.header, name))
 
     async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
-            return cached if cached is not None else await _fetched(self._store.versioned_header, name)
+            return cached if cached is not None else await in_own_thread(partial(self._store.versioned_header, name))
 
     async def version(self, name: str) -> FileVersion:
         with scene_to_blame():
@@ -174,12 +172,6 @@ class SceneCatalog:
             return None
         except UltragrayError as error:
             return CatalogEntry(name, None, error)
-
-
-async def _fetched(read: Callable[[str], T], name: str) -> T:
-    """What may have to come from a bucket first, read in a thread of its own that knows who asks."""
-    context = copy_context()
-    return await in_own_thread(lambda: context.run(read, name))
 
 
 def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:

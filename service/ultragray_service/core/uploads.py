@@ -7,7 +7,6 @@ import contextlib
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
-from contextvars import copy_context
 from dataclasses import dataclass
 from datetime import datetime, time, timedelta, timezone
 from functools import partial
@@ -263,7 +262,7 @@ class DatasetUpload:
                     return await asyncio.to_thread(self._incoming.present, self._name), False
                 await asyncio.sleep(_POLL_INTERVAL_S)  # another upload of the name is being checked
             await self._claim.spread()
-            return await to_its_end(partial(copy_context().run, self._accept))
+            return await to_its_end(self._accept)
 
     async def _take_name(self) -> bool:
         """Whether the name is now this upload's; it is not where there is a dataset, whoever has it."""
@@ -334,7 +333,7 @@ class SceneImports:
                 return await self._named(made, name, making(), private=private)
             await making()
             header = await asyncio.to_thread(read_header, made)
-            await to_its_end(partial(copy_context().run, self._replace, made, name, before))
+            await to_its_end(partial(self._replace, made, name, before))
             return header
 
     @asynccontextmanager
