@@ -1,10 +1,4 @@
-"""What a search compares: frames by their structures, after motions of the probe.
-
-What a motion within its image plane does to a frame, by the frame alone: its pixels slide.
-
-Shadows and gain slide along, which they would not quite do in a frame rendered there. To tell the next step of a search
-that is near enough, and it takes no rendering.
-"""
+"""What a search compares: frames by their structures, after small motions of the probe."""
 
 from __future__ import annotations
 
@@ -20,38 +14,6 @@ from torch.nn import functional
 from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training.poses import turned_by
-
-IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
-
-
-def places_after(probe: Probe, motions: Tensor, rows: int, columns: int) -> Tensor:
-    """Where in a frame [rows, columns] the pixels of frames after motions [S, 4, 4] lie: [S, rows, columns, 2].
-
-    The two numbers are column and row in [-1, 1], as functional.grid_sample() takes them.
-    """
-    pixels = pixel_positions_mm(probe, rows, columns)
-    moves = motions.numpy()
-    moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]
-    depth, across = (share.reshape(rows, columns) for share in probe.lines.coordinates(pixels[:, 0], pixels[:, 2]))
-    rows_after, columns_after = probe.lines.coordinates(moved[..., 0], moved[..., 2])
-    places = np.stack(
-        [
-            2.0 * (columns_after - across[0, 0]) / (across[0, -1] - across[0, 0]) - 1.0,
-            2.0 * (rows_after - depth[0, 0]) / (depth[-1, 0] - depth[0, 0]) - 1.0,
-        ],
-        axis=-1,
-    )
-    return torch.from_numpy(places.reshape(len(motions), rows, columns, 2)).float()
-
-
-def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -> [K, S, H, W]
-    """Each frame after each step, by places_after(); what comes in from outside is as the edge was."""
-    count, rows, columns = frames.shape
-    repeated = frames[:, None].expand(count, len(places), rows, columns).reshape(-1, 1, rows, columns)
-    grid = places.repeat(count, 1, 1, 1)
-    after = functional.grid_sample(repeated, grid, mode="bicubic", padding_mode="border", align_corners=True)
-    return after.reshape(count, len(places), rows, columns)
-
 
 # Small motions of the probe: shifts along its own axes and turns about the middle of its image, all in mm.
 #
@@ -96,6 +58,25 @@ class Motions:
 
     def degrees(self, turns_mm: Tensor) -> Tensor:
         return torch.rad2deg(turns_mm / self.lever_mm)
+
+
+_SMALL_MM = 1e-3
+
+
+@lru_cache(maxsize=32)
+def displacements(probe: Probe, rows: int, columns: int) -> Tensor:  # [6, 3, rows, columns]
+    """What pixels of a frame come to show, per mm of each number of a motion: the tissue so many rows and columns
+    further on, and so many mm out of the image plane.
+    """
+    pixels, across = pixel_positions_mm(probe, rows, columns), probe.lines
+    steps = _SMALL_MM * torch.eye(6, dtype=torch.float64)
+    moves = Motions.of(probe).of_steps(torch.cat([steps, -steps])).numpy()
+    moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]  # [12, pixels, 3]
+    depths_mm, lines = across.coordinates(moved[..., 0], moved[..., 2])
+    row_mm, pitch = probe.scan_line_length_mm / rows, across.span / columns
+    places = np.stack([depths_mm / row_mm, lines / pitch, moved[..., 1]], axis=1)
+    changes = (places[:6] - places[6:]) / (2.0 * _SMALL_MM)
+    return torch.from_numpy(changes.reshape(6, 3, rows, columns)).float()
 
 
 # What of a frame is compared: its structures at some size, whatever gain and shadow made of their brightness.

@@ -22,7 +22,7 @@ from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import turns_of
-from ultragray.learn.localization.appearance import IN_PLANE, Motions, Scale, places_after, slid
+from ultragray.learn.localization.appearance import Motions, Scale, displacements
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings, SearchKind
 from ultragray.rendering.frames import render
 from ultragray.rendering.limits import UNLIMITED, Limits
@@ -30,12 +30,17 @@ from ultragray.scene.gaussians import GaussianScene
 
 # localize(): the pose at which a scene looks like a real frame, by Levenberg and Marquardt from coarse to fine.
 #
-# How each pixel changes with the pose comes from small frames on either side of it (on one side only they mislead),
-# twelve of them. Six are of motions within the image plane: these the frame at the pose tells itself, and only to say
-# how certain the result is are they rendered. The steps that follow bring one frame each, which corrects the changes
-# along the step (Broyden 1965); they are taken anew where such a step fails or has arrived, and after a few: of
-# coarse frames, where the place is far, after each. A backward pass would tell how one number changes, the sum of all
-# squares; to get on with that alone takes many times as many steps.
+# How each pixel A(x, z) changes with the pose comes from small frames on either side of it (on one side only they
+# mislead). Motions within the image plane need none: the frame at the pose tells them by its own gradient, as a motion
+# brings the tissue at p + d(p) to where p was, and so changes A by ∇A · d. The turns out of the plane move each pixel
+# along elevation, too, by an amount that is its distance from the axis: where two frames beside the pose give ∂A/∂y,
+# they need no frames of their own either. Shadows and thickness do not quite follow, so that tracking alone, which
+# begins near the place, makes do with these two; a search renders six, and all twelve to say how certain its result is.
+#
+# The steps that follow bring one frame each, which corrects the changes along the step (Broyden 1965); they are taken
+# anew where such a step fails or has arrived, and after a few: of coarse frames, where the place is far, after each. A
+# backward pass would tell how one number changes, the sum of all squares; to get on with that alone takes many times as
+# many steps.
 #
 # Fine structures hold a search fast at places a millimetre beside the right one. So it goes back to smoother frames
 # once before it ends: from such a place they lead on.
@@ -48,12 +53,16 @@ BLOCKS = (8, 6)  # of the image, along depth and across, that err independently 
 LEAST_PIXELS = 32  # of a side of a frame that can be found
 
 
+ELEVATION = 1  # of the six numbers of a motion
+OUT_OF_PLANE, ALL = (1, 3, 5), (0, 1, 2, 3, 4, 5)
+
+
 @dataclass(frozen=True)
 class Stage:
     """At most so many steps at one scale.
 
-    `probing_mm` is how far the frames on either side are taken from a pose, and `corrected` how many steps may follow
-    before they are taken anew.
+    `probing_mm` is how far the frames on either side are taken from a pose, `rendered` the numbers of a motion that
+    they are taken for, and `corrected` how many steps may follow before they are taken anew.
     """
 
     rows: int
@@ -63,6 +72,7 @@ class Stage:
     probing_mm: float
     corrected: int
     kept: int = 1  # of the poses that it begins with
+    rendered: tuple[int, ...] = OUT_OF_PLANE
 
 
 COARSE = Stage(64, 48, 3.0, 4, 1.0, 1, kept=2)
@@ -70,7 +80,10 @@ MIDDLE = Stage(64, 48, 1.5, 5, 0.6, 2)
 FINE = Stage(128, 96, 0.8, 4, 0.3, 4)
 LAST = Stage(128, 96, 0.5, 6, 0.2, 4)
 STAGES = (COARSE, MIDDLE, FINE, MIDDLE, FINE, LAST)
-TRACKING = (replace(MIDDLE, steps=2), replace(FINE, steps=2))  # from the frame before, in a tenth of the time
+TRACKING = (  # from the frame before, by a tenth of the frames
+    Stage(96, 72, 1.0, 1, 0.3, 1, rendered=(ELEVATION,)),
+    Stage(96, 72, 0.5, 3, 0.3, 4, rendered=(ELEVATION,)),
+)
 MOST_BEGUN = 6  # poses at the coarse stage
 MOST_TRIED = 64  # poses that are looked at before, where the start is less certain
 START_DAMPING, MORE_DAMPING, LESS_DAMPING = 1e-2, 6.0, 3.0
@@ -352,7 +365,7 @@ class _Search:
         fit = self._linearised(poses, stage, scale, target)
         damping = torch.full((len(poses),), START_DAMPING, dtype=torch.float64)
         short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is LAST else SHORT_STEP)
-        for _ in range(stage.steps):
+        for left in reversed(range(stage.steps)):
             steps = _step(fit, damping)
             has_arrived = steps.norm(dim=1) < short_mm
             was_fresh = fit.corrections == 0
@@ -363,16 +376,14 @@ class _Search:
             is_misled = ~better & ~was_fresh
             damping = torch.where(better, damping / LESS_DAMPING, damping * torch.where(is_misled, 1.0, MORE_DAMPING))
             doubtful = is_misled | (has_arrived & ~was_fresh) | (better & (fit.corrections >= stage.corrected))
-            if doubtful.any():
+            if left and doubtful.any():
                 fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
         return fit.poses[fit.error.argsort(stable=True)[: stage.kept]]
 
     def result(self, pose: Tensor, start: Tensor, stage: Stage) -> Localization:
-        """What is told of the best pose, by the last stage; how certain it is, by frames of all motions, unless in
-        haste.
-        """
+        """What is told of the best pose, by the last stage."""
         scale, target = self._at(stage)
-        fit = self._linearised(pose[None], stage, scale, target, slides=stage is not LAST)
+        fit = self._linearised(pose[None], stage, scale, target, ALL if stage is LAST else stage.rendered)
         similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
         deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
@@ -407,34 +418,28 @@ class _Search:
     def linearised(self, poses: Tensor, stage: Stage) -> _Fit:  # [K, 4, 4]
         return self._linearised(poses, stage, *self._at(stage))
 
-    def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
-        """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""
-        count, size = len(poses), (scale.rows, scale.columns)
-        motions, is_slid, places = _beside(self._probe, stage.probing_mm, *size)
-        if not slides:
-            is_slid = torch.zeros_like(is_slid)
-        here = self._frames(poses, *size)
-        rendered = poses[:, None] @ motions[~is_slid]
-        frames = torch.empty(count, len(is_slid), *size)
-        frames[:, ~is_slid] = self._frames(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
-        if slides:
-            frames[:, is_slid] = slid(here, places)
-        left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(is_slid), -1)
-        changes = (left[:, :6] - left[:, 6:]) / (2.0 * stage.probing_mm)
-        return _Fit(poses, _missed(here, scale, target), changes, torch.zeros(count, dtype=torch.int64))
+    def _linearised(
+        self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, rendered: tuple[int, ...] | None = None
+    ) -> _Fit:
+        """The fit at poses [K, 4, 4], and its changes, by frames on either side for the numbers that are `rendered`."""
+        size, numbers = (scale.rows, scale.columns), list(stage.rendered if rendered is None else rendered)
+        motions = _beside(self._probe, stage.probing_mm)[:, numbers]
+        here = scale.appearance(self._frames(poses, *size))  # [K, H, W]
+        frames = self._frames((poses[:, None, None] @ motions).reshape(-1, 4, 4), *size)
+        after = scale.appearance(frames).reshape(len(poses), 2, -1, *size)
+        differences = (after[:, 0] - after[:, 1]) / (2.0 * stage.probing_mm)
+        gradient = torch.stack([*torch.gradient(here, dim=(1, 2)), differences[:, numbers.index(ELEVATION)]], dim=1)
+        changes = torch.einsum("kdhw,sdhw->kshw", gradient, displacements(self._probe, *size))
+        changes[:, numbers] = differences
+        left = (here - target).flatten(1).double()
+        return _Fit(poses, left, changes.flatten(2).double(), torch.zeros(len(poses), dtype=torch.int64))
 
 
 @lru_cache(maxsize=32)
-def _beside(probe: Probe, step_mm: float, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The motions [12, 4, 4] of the central differences, for each of the six numbers a step forwards, then backwards.
-
-    Then [12] whether a motion is within the image plane, and of those that are `places_after`.
-    """
+def _beside(probe: Probe, step_mm: float) -> Tensor:  # [2, 6, 4, 4]
+    """The motions of the central differences: for each of the six numbers a step forwards, then backwards."""
     ahead = step_mm * torch.eye(6, dtype=torch.float64)
-    steps = torch.cat([ahead, -ahead])
-    is_slid = steps[:, IN_PLANE].any(dim=1)
-    motions = Motions.of(probe).of_steps(steps)
-    return motions, is_slid, places_after(probe, motions[is_slid], rows, columns)
+    return Motions.of(probe).of_steps(torch.stack([ahead, -ahead]))
 
 
 def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]

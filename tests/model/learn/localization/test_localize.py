@@ -1,6 +1,7 @@
 """localize(): frames of a scene are found again from a start that is off, and what cannot be found is told."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from ultragray import ConvexProbe, LinearProbe, localize, render
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.learn.localization import search
-from ultragray.learn.localization.appearance import Motions, places_after, slid
+from ultragray.learn.localization.appearance import Motions, displacements
 from ultragray.learn.localization.search import Tracker, _deviations
 from ultragray.learn.localization.settings import SearchKind
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import demo_poses, load_demo_scene
+from ultragray.rendering.limits import UNLIMITED
 
 SIDE = 128
 FOUND_MM, FOUND_DEG = 0.5, 1.0
@@ -185,32 +187,43 @@ def test_a_turn_is_about_the_middle_of_the_image():
 ROWS, COLUMNS = 41, 21
 LINEAR = LinearProbe(40.0, 0.0, 80.0)
 CONVEX = ConvexProbe(60.0, 20.0, 100.0)  # as deep as the linear one
-POSITIONS = pixel_positions_mm(LINEAR, ROWS, COLUMNS).reshape(ROWS, COLUMNS, 3)
-ACROSS_MM, DOWN_MM = float(POSITIONS[0, 1, 0] - POSITIONS[0, 0, 0]), float(POSITIONS[1, 0, 2] - POSITIONS[0, 0, 2])
+ROW_MM = 80.0 / ROWS
 
 
-def frames(count=2):
-    return torch.rand(count, ROWS, COLUMNS, generator=torch.Generator().manual_seed(0))
-
-
-def after(probe, *steps):  # [6] mm each -> [K, S, ROWS, COLUMNS]
-    motions = Motions.of(probe).of_steps(torch.tensor(steps, dtype=torch.float64))
-    return slid(frames(), places_after(probe, motions, ROWS, COLUMNS))
-
-
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
-def test_without_a_motion_they_stay(probe):
-    torch.testing.assert_close(after(probe, (0.0,) * 6)[:, 0], frames(), atol=1e-4, rtol=0.0)
-
-
-def test_a_probe_that_moves_by_a_pixel_sees_what_was_beside_it():
-    aside, deeper = after(LINEAR, (ACROSS_MM, 0, 0, 0, 0, 0), (0, 0, DOWN_MM, 0, 0, 0)).unbind(dim=1)
-    torch.testing.assert_close(aside[..., :-1], frames()[..., 1:], atol=1e-4, rtol=0.0)
-    torch.testing.assert_close(deeper[:, :-1], frames()[:, 1:], atol=1e-4, rtol=0.0)
+def test_a_motion_within_the_image_plane_moves_all_pixels_of_a_linear_probe_alike():
+    aside, _, deeper = displacements(LINEAR, ROWS, COLUMNS)[:3]
+    for found, row, column in ((aside, 0.0, COLUMNS / 40.0), (deeper, 1.0 / ROW_MM, 0.0)):
+        expected = torch.tensor([row, column, 0.0])[:, None, None].expand(3, ROWS, COLUMNS)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
 
 
 def test_on_a_fan_only_the_middle_line_moves_along_itself():
-    deeper = after(CONVEX, (0, 0, DOWN_MM, 0, 0, 0))[:, 0]
-    middle = COLUMNS // 2
-    torch.testing.assert_close(deeper[:, :-1, middle], frames()[:, 1:, middle], atol=1e-4, rtol=0.0)
-    assert (deeper[:, :-1, 0] - frames()[:, 1:, 0]).abs().max() > 0.1
+    deeper = displacements(CONVEX, ROWS, COLUMNS)[2]
+    assert deeper[0, :, COLUMNS // 2].numpy() == pytest.approx(1.0 / ROW_MM, abs=1e-5)
+    assert deeper[1, :, COLUMNS // 2].numpy() == pytest.approx(0.0, abs=1e-5)
+    assert deeper[0, :, 0].max() < 0.9 / ROW_MM
+    assert deeper[1, :, 0].abs().min() > 0.01
+
+
+def test_a_turn_out_of_the_plane_moves_pixels_by_their_distance_from_its_axis():
+    _, elevation, _, tilt, _, yaw = displacements(LINEAR, ROWS, COLUMNS)[:, 2]
+    x, z = np.moveaxis(pixel_positions_mm(LINEAR, ROWS, COLUMNS).reshape(ROWS, COLUMNS, 3), -1, 0)[[0, 2]]
+    lever_mm = Motions.of(LINEAR).lever_mm
+    np.testing.assert_allclose(elevation, 1.0, atol=1e-6)
+    np.testing.assert_allclose(tilt, -(z - 40.0) / lever_mm, atol=1e-5)
+    np.testing.assert_allclose(yaw, x / lever_mm, atol=1e-5)
+
+
+def test_two_frames_tell_how_a_frame_changes_by_all_six_numbers(demo):
+    """Nearly as twelve of them do: where a shadow begins, or tissue ends, they differ."""
+    probe, pose = demo.info.probe_or(None), demo_poses(3)[1]
+    motions = Motions.of(probe)
+    looked = search._Search(
+        torch.from_numpy(frame_of(demo, pose)), probe, motions, search._renderer(demo, probe, "auto", UNLIMITED)
+    )
+    fits = [
+        looked.linearised(torch.from_numpy(pose)[None], replace(search.TRACKING[0], rendered=rendered)).changes[0]
+        for rendered in ((search.ELEVATION,), search.ALL)
+    ]
+    for one, other in zip(*fits, strict=True):
+        assert float((one * other).sum() / (one.norm() * other.norm())) > 0.8
