@@ -138,7 +138,7 @@ class Service:
     def begin_draining(self) -> None:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""
         self.life.begin_draining()
-        self.jobs.hub.close()
+        self.jobs.hub.closing.set()
         for prepared in self._prepared:
             prepared.end()
 

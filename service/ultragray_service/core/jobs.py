@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Concatenate, ParamSpec, TypeAlias, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -128,16 +129,17 @@ class JobChange:
     log_offset: int  # the byte of the log after these lines
 
 
+Looked: TypeAlias = tuple[Job, int]  # a job, and the bytes of its log
+
+
 class JobWatch:
     """One watcher's part. A watcher that reads slowly gets the newest state and every line of the log."""
 
-    def __init__(self, log: GrowingLog, threads: Executor | None, leave: Callable[[JobWatch], None]) -> None:
-        self._log, self._threads, self._leave = log, threads, leave
-        self._job: Job | None = None
+    def __init__(self, look: Callable[[], Awaitable[Looked]], log: GrowingLog, hub: JobHub) -> None:
+        self._look, self._log, self._hub = look, log, hub
+        self._seen: Looked | None = None
+        self._told: Job | None = None
         self.finished = False  # whether the final state was told
-        self._ended = False
-        self._error: Exception | None = None
-        self._news = asyncio.Event()
 
     async def next(self, timeout_s: float) -> JobChange | None:
         """The changes since the last call, after at most `timeout_s` seconds (none: an empty change).
@@ -145,137 +147,61 @@ class JobWatch:
         The final state comes with the last lines or after them; then None, as when the service stops. Raises what
         reading the job raises.
         """
-        loop = asyncio.get_running_loop()
-        end = loop.time() + timeout_s
-        while True:
-            if self._news.is_set():
-                change = await self._take()
+        end = time.monotonic() + timeout_s
+        while not self.finished and not self._hub.closing.is_set():
+            try:
+                seen = await self._look()
+            except (DatabaseUnavailable, StorageUnavailable):
+                if self._seen is None:
+                    raise
+                seen = self._seen  # it comes back, and the watchers have nothing else to do
+            if self._log.has_more or seen != self._seen:
+                self._seen = seen
+                change = await self._change(seen[0])
                 if change.job is not None or change.log:
                     return change
-            elif self._ended:
-                if self._error is not None:
-                    raise self._error
-                return None
-            else:
-                try:
-                    await asyncio.wait_for(self._news.wait(), max(0.0, end - loop.time()))
-                except asyncio.TimeoutError:
-                    return JobChange(None, "", self._log.offset)
+            if (left_s := end - time.monotonic()) <= 0:
+                return JobChange(None, "", self._log.offset)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._hub.closing.wait(), min(READ_INTERVAL_S, left_s))
+        return None
 
-    async def _take(self) -> JobChange:
-        self._news.clear()
-        job, self._job = self._job, None
+    async def _change(self, job: Job) -> JobChange:
         # After the state was read, so that the log of a finished job is whole.
-        lines = await asyncio.get_running_loop().run_in_executor(self._threads, self._log.read)
-        if self._log.has_more:
-            self._news.set()
-            if job is not None and job.state.is_final:
-                job, self._job = None, job
+        lines = await self._hub.in_thread(self._log.read)
+        if job == self._told or (job.state.is_final and self._log.has_more):
+            return JobChange(None, lines, self._log.offset)
+        self._told, self.finished = job, job.state.is_final
         return JobChange(job, lines, self._log.offset)
-
-    def tell(self, job: Job | None) -> None:
-        """The job's newest state where it changed, or else that its log grew."""
-        if job is not None:
-            self._job = job
-            self.finished = job.state.is_final
-        self._news.set()
-
-    def end(self, error: Exception | None = None) -> None:
-        self._ended = True
-        self._error = error
-        self._news.set()
-
-    def close(self) -> None:
-        self._leave(self)
-
-
-class _Reader:
-    """Reads one job for all of its watchers, until its final state or until nobody watches."""
-
-    def __init__(self, read: Callable[[], Job], log: Log, threads: Executor | None) -> None:
-        self._read, self._threads, self._log = read, threads, log
-        self._log_bytes = 0
-        self._job: Job | None = None
-        self.watches: set[JobWatch] = set()
-        self.task = asyncio.ensure_future(self._run())
-
-    def add(self, watch: JobWatch) -> None:
-        self.watches.add(watch)
-        if self._job is not None:
-            watch.tell(self._job)
-
-    async def _run(self) -> None:
-        error: Exception | None = None
-        try:
-            while self._job is None or not self._job.state.is_final:
-                if self._job is not None:
-                    await asyncio.sleep(READ_INTERVAL_S)
-                try:
-                    job, log_bytes = await asyncio.get_running_loop().run_in_executor(self._threads, self._look)
-                except (DatabaseUnavailable, StorageUnavailable):
-                    if self._job is None:
-                        raise
-                    continue  # it comes back, and the watchers have nothing else to do
-                changed = job if job != self._job else None
-                has_grown = log_bytes != self._log_bytes
-                self._job, self._log_bytes = job, log_bytes
-                if changed is not None or has_grown:
-                    for watch in self.watches:
-                        watch.tell(changed)
-        except Exception as raised:
-            error = raised
-        finally:
-            for watch in self.watches:
-                watch.end(error)
-
-    def _look(self) -> tuple[Job, int]:
-        job = self._read()  # first, so that the log of a finished job is whole
-        return job, self._log.size()
 
 
 class JobHub:
-    """The watchers of all jobs. Belongs to one event loop."""
+    """The watchers of all jobs, for each of which a job is read once in READ_INTERVAL_S. Belongs to one event loop."""
 
     def __init__(self, get: Callable[[str], Job], log: Callable[[str], Log], threads: Executor | None = None) -> None:
-        self._get, self._threads, self._log = get, threads, log
-        self._readers: dict[str, _Reader] = {}
-        self._closed = False
-
-    @property
-    def readers(self) -> int:
-        return len(self._readers)
+        self._get, self._log, self._threads = get, log, threads
+        self._reads: dict[str, tuple[float, asyncio.Future[Looked]]] = {}  # when each began
+        self.closing = asyncio.Event()
 
     async def watch(self, job_id: str, log_offset: int | None = None) -> JobWatch:
-        """A watcher, to be closed, of a job and its log from `log_offset` on (None: its end). Raises JobNotFound."""
-        reader = self._readers.get(job_id)
-        if reader is None or reader.task.done():
-            await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
-            reader = self._readers.get(job_id)  # another watcher may have come in the meantime
-        log = GrowingLog(self._log(job_id), log_offset)
-        if self._closed:
-            over = JobWatch(log, self._threads, lambda leaving: None)
-            over.end()
-            return over
-        if reader is None or reader.task.done():
-            reader = _Reader(partial(self._get, job_id), self._log(job_id), self._threads)
-            self._readers[job_id] = reader
-        watch = JobWatch(log, self._threads, partial(self._remove, job_id, reader))
-        reader.add(watch)
-        return watch
+        """A watcher of a job and its log from `log_offset` on (None: its end). Raises JobNotFound."""
+        look = partial(self._look, job_id, self._log(job_id))
+        await look()
+        return JobWatch(look, GrowingLog(self._log(job_id), log_offset), self)
 
-    def _remove(self, job_id: str, reader: _Reader, watch: JobWatch) -> None:
-        reader.watches.discard(watch)
-        if not reader.watches:
-            reader.task.cancel()
-            if self._readers.get(job_id) is reader:
-                del self._readers[job_id]
+    async def _look(self, job_id: str, log: Log) -> Looked:
+        def look() -> Looked:
+            job = self._get(job_id)  # first, so that the log of a finished job is whole
+            return job, log.size()
 
-    def close(self) -> None:
-        self._closed = True
-        for reader in self._readers.values():
-            reader.task.cancel()
-            for watch in reader.watches:
-                watch.end()
+        now = time.monotonic()
+        self._reads = {name: read for name, read in self._reads.items() if now - read[0] < READ_INTERVAL_S}
+        if job_id not in self._reads:
+            self._reads[job_id] = now, asyncio.ensure_future(self.in_thread(look))
+        return await asyncio.shield(self._reads[job_id][1])
+
+    def in_thread(self, call: Callable[[], T]) -> Awaitable[T]:
+        return asyncio.get_running_loop().run_in_executor(self._threads, call)
 
 
 MAX_POSES = 256  # that an estimate tells

@@ -100,7 +100,6 @@ class ScenePlaces(Collector):
         )
 
 
-
 _FOLDERS = re.compile(r"^/.*/(?=[^/]+\.ugr\b)", re.DOTALL)
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000

@@ -283,15 +283,12 @@ async def _download_artifact(service: Service, request: Any, context: Context) -
 async def _watch_job(service: Service, request: Any, context: Context) -> None:
     service.life.require_serving()
     watch = await service.jobs.hub.watch(request.job)
-    try:
-        while (change := await watch.next(_LOOK_AROUND_S)) is not None:
-            if change.job is not None or change.log:
-                job = None if change.job is None else job_message(change.job)
-                await context.write(jobs_pb2.JobEvent(job=job, log=change.log))
-        if not watch.finished:
-            raise Draining("the service is stopping; watch the job again when it is back")
-    finally:
-        watch.close()
+    while (change := await watch.next(_LOOK_AROUND_S)) is not None:
+        if change.job is not None or change.log:
+            job = None if change.job is None else job_message(change.job)
+            await context.write(jobs_pb2.JobEvent(job=job, log=change.log))
+    if not watch.finished:
+        raise Draining("the service is stopping; watch the job again when it is back")
 
 
 STREAMS: Mapping[str, Stream] = {

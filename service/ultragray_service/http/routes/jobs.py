@@ -15,7 +15,6 @@ from fastapi import APIRouter, Header, Path, Query
 from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
@@ -64,24 +63,6 @@ class LastEvent:
         if (found := _ID.fullmatch(event_id)) is None:
             return cls()
         return cls(int(found[1]), found[2])
-
-
-class JobEvents(StreamingResponse):
-    """Answers with the events of a watch, and closes it when the job is final or the client has gone."""
-
-    def __init__(self, watch: JobWatch, last: LastEvent) -> None:
-        super().__init__(
-            _events(watch, last),
-            media_type=EVENTS_TYPE,
-            headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},  # the second: proxies pass it on at once
-        )
-        self._watch = watch
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._watch.close()
 
 
 async def _events(watch: JobWatch, last: LastEvent) -> AsyncIterator[bytes]:
@@ -260,11 +241,15 @@ async def get_artifact(
 
 
 @router.get("/{job}/events", response_class=StreamingResponse, responses=_EVENTS | problems(401, 404, 422, 503))
-async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> JobEvents:
+async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> StreamingResponse:
     """Follows a job. A stream that ends before the final state goes on where it ended: say the id of its last event."""
     service.life.require_serving()
     last = LastEvent.read(last_event_id)
-    return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)
+    return StreamingResponse(
+        _events(await service.jobs.hub.watch(job, last.log_offset), last),
+        media_type=EVENTS_TYPE,
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},  # the second: proxies pass it on at once
+    )
 
 
 # A page that a job made is shown without scripts, in an origin of its own, and fetches nothing.
