@@ -78,7 +78,7 @@ class Machine:
         """Starts again what has died, and learns where the server listens."""
         if not self._servers or self._servers[-1].poll() is not None:
             self.http = self.grpc = None
-            embedded = {"ULTRAGRAY_EMBEDDEDWORKER": str(self._with_workers)}
+            embedded = {"ULTRAGRAY_EMBEDDED_WORKER": str(self._with_workers)}
             self._servers.append(self._spawn(SERVE, f"server-{len(self._servers)}", embedded))
         if self._with_workers and (not self._workers or self._workers[-1].poll() is not None):
             self._workers.append(self._spawn(WORK, f"worker-{len(self._workers)}", {}))

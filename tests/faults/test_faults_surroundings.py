@@ -100,6 +100,7 @@ def test_every_job_ends_as_if_nothing_had_failed(machine, postgres):
             assert answer is not None, machine.told()
             ids[body["request_id"]] = answer[0]
         machine.bring_workers()
+        assert machine.strike("server", random.Random(SEED))  # the next one has a worker, too
         due_at = began
         total = sum(STEPS + more for _, _, _, more in TRAININGS)
         while True:
