@@ -3,6 +3,9 @@
 
 ClientError
 ├── InvalidArgument
+│   ├── RequestMalformed
+│   ├── UploadTooLarge
+│   ├── TargetTooLong
 │   ├── InvalidPose
 │   ├── InvalidProbe
 │   ├── InvalidImageSize
@@ -10,26 +13,11 @@ ClientError
 │   ├── LowConfidence
 │   ├── FrameTooCostly
 │   ├── TooManyPoses
-│   ├── HeadersTooLarge
-│   ├── TargetTooLong
-│   ├── RequestMalformed
 │   ├── DatasetInvalid
-│   └── UploadTooLarge
+│   └── HeadersTooLarge
 ├── Unauthenticated
-├── Unavailable
-│   ├── IssuerUnavailable
-│   ├── TooManyConnections
-│   ├── StorageUnavailable
-│   ├── DatabaseUnavailable
-│   ├── ArtifactFolderUnavailable
-│   ├── NotReady
-│   ├── Draining
-│   └── Unreachable
 ├── PermissionDenied
 │   └── HostRefused
-├── DeadlineExceeded
-│   ├── RequestTooSlow
-│   └── JobTimeExceeded
 ├── NotFound
 │   ├── SceneNotFound
 │   ├── RegistrationNotFound
@@ -37,33 +25,45 @@ ClientError
 │   ├── JobNotFound
 │   ├── WorkerNotFound
 │   └── ArtifactNotFound
-├── FailedPrecondition
-│   ├── SceneFileInvalid
-│   ├── DatasetInUse
-│   ├── JobFinished
-│   ├── JobNotFinished
-│   └── JobInUse
+├── DeadlineExceeded
+│   ├── RequestTooSlow
+│   └── JobTimeExceeded
+├── Aborted
+│   └── RecordingTaken
 ├── AlreadyExists
 │   ├── DatasetExists
 │   ├── SceneExists
 │   └── RequestIdConflict
-├── Aborted
-│   └── RecordingTaken
+├── FailedPrecondition
+│   ├── DatasetInUse
+│   ├── JobFinished
+│   ├── JobNotFinished
+│   ├── JobInUse
+│   └── SceneFileInvalid
 ├── ResourceExhausted
-│   ├── StorageFull
-│   ├── MemoryExceeded
-│   ├── JobQueueFull
-│   ├── SceneTooLarge
+│   ├── LimitReached
 │   ├── QueueFull
 │   ├── RateLimited
-│   └── LimitReached
+│   ├── JobQueueFull
+│   ├── StorageFull
+│   ├── MemoryExceeded
+│   └── SceneTooLarge
 ├── JobStalled
-├── Unimplemented
-│   ├── BackendUnavailable
-│   └── ExtraMissing
 ├── BackupInvalid
 ├── RestoreRefused
 ├── RenderFailed
+├── Unimplemented
+│   ├── BackendUnavailable
+│   └── ExtraMissing
+├── Unavailable
+│   ├── TooManyConnections
+│   ├── NotReady
+│   ├── Draining
+│   ├── IssuerUnavailable
+│   ├── StorageUnavailable
+│   ├── DatabaseUnavailable
+│   ├── ArtifactFolderUnavailable
+│   └── Unreachable
 ├── TlsFailed
 └── StreamEnded
 
@@ -77,6 +77,18 @@ from .client_error import ClientError as ClientError
 
 class InvalidArgument(ClientError, ValueError):
     """A value that cannot be used; `field` names it as the caller wrote it."""
+
+
+class RequestMalformed(InvalidArgument):
+    """Bytes that are no HTTP request, or too many requests at once on one connection."""
+
+
+class UploadTooLarge(InvalidArgument):
+    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+
+
+class TargetTooLong(InvalidArgument):
+    """Path and query of a request over 16 KiB."""
 
 
 class InvalidPose(InvalidArgument):
@@ -107,64 +119,16 @@ class TooManyPoses(InvalidArgument):
     """More poses, or pixels, than one request may have; send several."""
 
 
-class HeadersTooLarge(InvalidArgument):
-    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
-
-
-class TargetTooLong(InvalidArgument):
-    """Path and query of a request over 16 KiB."""
-
-
-class RequestMalformed(InvalidArgument):
-    """Bytes that are no HTTP request, or too many requests at once on one connection."""
-
-
 class DatasetInvalid(InvalidArgument):
     """A tracked sweep that cannot be used; names the file, the frame and the reason."""
 
 
-class UploadTooLarge(InvalidArgument):
-    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+class HeadersTooLarge(InvalidArgument):
+    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
 
 class Unauthenticated(ClientError):
     """No API key, or an unknown one."""
-
-
-class Unavailable(ClientError):
-    """Base of the errors whose gRPC status is UNAVAILABLE."""
-
-
-class IssuerUnavailable(Unavailable):
-    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
-
-
-class TooManyConnections(Unavailable):
-    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
-
-
-class StorageUnavailable(Unavailable):
-    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
-
-
-class DatabaseUnavailable(Unavailable):
-    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
-
-
-class ArtifactFolderUnavailable(Unavailable):
-    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
-
-
-class NotReady(Unavailable):
-    """The service is starting, or cannot render at the moment; retry."""
-
-
-class Draining(Unavailable):
-    """The service is stopping; retry elsewhere."""
-
-
-class Unreachable(Unavailable):
-    """Nobody answers at the address, or the connection broke."""
 
 
 class PermissionDenied(ClientError):
@@ -173,18 +137,6 @@ class PermissionDenied(ClientError):
 
 class HostRefused(PermissionDenied):
     """A `Host` that the service is not known as, where it asks for no key."""
-
-
-class DeadlineExceeded(ClientError, TimeoutError):
-    """The deadline passed first."""
-
-
-class RequestTooSlow(DeadlineExceeded):
-    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
-
-
-class JobTimeExceeded(DeadlineExceeded):
-    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
 
 class NotFound(ClientError):
@@ -215,28 +167,24 @@ class ArtifactNotFound(NotFound):
     """The job has no file of that name."""
 
 
-class FailedPrecondition(ClientError):
-    """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
+class DeadlineExceeded(ClientError, TimeoutError):
+    """The deadline passed first."""
 
 
-class SceneFileInvalid(FailedPrecondition):
-    """A scene file that is truncated, foreign or inconsistent."""
+class RequestTooSlow(DeadlineExceeded):
+    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
 
-class DatasetInUse(FailedPrecondition):
-    """A job needs the dataset."""
+class JobTimeExceeded(DeadlineExceeded):
+    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
 
-class JobFinished(FailedPrecondition):
-    """A job that succeeded or failed cannot be cancelled."""
+class Aborted(ClientError):
+    """Base of the errors whose gRPC status is ABORTED."""
 
 
-class JobNotFinished(FailedPrecondition):
-    """Only a failed or cancelled job can be retried."""
-
-
-class JobInUse(FailedPrecondition):
-    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
+class RecordingTaken(Aborted):
+    """Two record into one recording at a time; one may."""
 
 
 class AlreadyExists(ClientError):
@@ -255,16 +203,48 @@ class RequestIdConflict(AlreadyExists):
     """The `request_id` was used for something else."""
 
 
-class Aborted(ClientError):
-    """Base of the errors whose gRPC status is ABORTED."""
+class FailedPrecondition(ClientError):
+    """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
 
 
-class RecordingTaken(Aborted):
-    """Two record into one recording at a time; one may."""
+class DatasetInUse(FailedPrecondition):
+    """A job needs the dataset."""
+
+
+class JobFinished(FailedPrecondition):
+    """A job that succeeded or failed cannot be cancelled."""
+
+
+class JobNotFinished(FailedPrecondition):
+    """Only a failed or cancelled job can be retried."""
+
+
+class JobInUse(FailedPrecondition):
+    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
+
+
+class SceneFileInvalid(FailedPrecondition):
+    """A scene file that is truncated, foreign or inconsistent."""
 
 
 class ResourceExhausted(ClientError):
     """Base of the errors whose gRPC status is RESOURCE_EXHAUSTED."""
+
+
+class LimitReached(ResourceExhausted):
+    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
+
+
+class QueueFull(ResourceExhausted):
+    """Too many frames wait, or too many uploads are under way; retry."""
+
+
+class RateLimited(ResourceExhausted):
+    """More requests or frames in a second than the key may have; retry."""
+
+
+class JobQueueFull(ResourceExhausted):
+    """Too many jobs wait; retry."""
 
 
 class StorageFull(ResourceExhausted):
@@ -277,28 +257,24 @@ class MemoryExceeded(ResourceExhausted):
     """
 
 
-class JobQueueFull(ResourceExhausted):
-    """Too many jobs wait; retry."""
-
-
 class SceneTooLarge(ResourceExhausted):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
 
 
-class QueueFull(ResourceExhausted):
-    """Too many frames wait, or too many uploads are under way; retry."""
-
-
-class RateLimited(ResourceExhausted):
-    """More requests or frames in a second than the key may have; retry."""
-
-
-class LimitReached(ResourceExhausted):
-    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
-
-
 class JobStalled(ClientError):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
+
+
+class BackupInvalid(ClientError):
+    """A backup that is not there, damaged, or made by a newer release (command line)."""
+
+
+class RestoreRefused(ClientError):
+    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
+
+
+class RenderFailed(ClientError):
+    """A worker could not render the frame."""
 
 
 class Unimplemented(ClientError):
@@ -315,16 +291,40 @@ class ExtraMissing(Unimplemented):
     """
 
 
-class BackupInvalid(ClientError):
-    """A backup that is not there, damaged, or made by a newer release (command line)."""
+class Unavailable(ClientError):
+    """Base of the errors whose gRPC status is UNAVAILABLE."""
 
 
-class RestoreRefused(ClientError):
-    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
+class TooManyConnections(Unavailable):
+    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
 
-class RenderFailed(ClientError):
-    """A worker could not render the frame."""
+class NotReady(Unavailable):
+    """The service is starting, or cannot render at the moment; retry."""
+
+
+class Draining(Unavailable):
+    """The service is stopping; retry elsewhere."""
+
+
+class IssuerUnavailable(Unavailable):
+    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
+
+
+class StorageUnavailable(Unavailable):
+    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
+
+
+class DatabaseUnavailable(Unavailable):
+    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
+
+
+class ArtifactFolderUnavailable(Unavailable):
+    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
+
+
+class Unreachable(Unavailable):
+    """Nobody answers at the address, or the connection broke."""
 
 
 class TlsFailed(ClientError):

@@ -28,18 +28,7 @@ from ultragray.samplers import Sampler
 from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray.scene.label_maps import parse_names, read_label_map, read_painted
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
-from ultragray_service.cli.editing import (
-    AtOption,
-    CutOption,
-    EditsOption,
-    InsertOption,
-    LesionsOption,
-    MergeOption,
-    RadiusOption,
-    SeedOption,
-    ThinOption,
-    edits_asked,
-)
+from ultragray_service.cli.editing import AskedEdits
 from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
@@ -278,26 +267,19 @@ def label_scene(
         "ultragray scenes edit left --into whole --merge right",
     ),
 )
+@with_options
 @with_connection
 def edit_scene(
     connection: Connection,
     name: NameArgument,
     into: Annotated[str, option("Name of the scene to make.", shown=False)],
-    edits: EditsOption = None,
-    cut_box_mm: CutOption = None,
-    merge: MergeOption = None,
-    insert: InsertOption = None,
-    at_mm: AtOption = None,
-    radius_mm: RadiusOption = 5.0,
-    lesions: LesionsOption = None,
-    seed: SeedOption = 0,
-    gaussians: ThinOption = None,
     private: Annotated[bool, option("Others do not see the scene that is made.", "--private")] = False,
     json: Json = False,
+    *,
+    edits: AskedEdits,
 ) -> None:
     """Have the service edit a scene, as another one that names its parents. Merged scenes are the service's, too."""
-    asked = edits_asked(edits, cut_box_mm, merge, insert, at_mm, radius_mm, lesions, seed, gaussians)
-    body = {"into": into, "private": private, "edits": to_dict(asked, with_none=False)}
+    body = {"into": into, "private": private, "edits": to_dict(edits.listed(), with_none=False)}
     scene = connection.json("POST", route("scenes", name, suffix=":edit"), body)
     tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, of {', '.join(scene['parents'])}", scene, as_json=json)
 

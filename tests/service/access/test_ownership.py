@@ -311,22 +311,13 @@ def test_it_stays_private_when_its_scene_is_deleted_and_another_takes_the_name(k
     assert keyed.http("bob", "DELETE", scene).status_code == 204
 
 
-def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed, scene_bytes):
-    scene = "/v1/scenes/patient-43"
+@pytest.mark.parametrize("replaced", [False, True], ids=["new", "in place of another's"])
+def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed, scene_bytes, replaced):
+    scene, body = "/v1/scenes/patient-43", {"scene": "demo", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
     assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
-    body = {"scene": "patient-43", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
-    assert keyed.http("admin", "PUT", ARM, json=body).status_code == 200
-    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
-    assert keyed.http("admin", "DELETE", ARM).status_code == 204
-    assert keyed.http("alice", "DELETE", scene).status_code == 204
-
-
-def test_an_admin_who_replaces_one_for_a_private_scene_takes_it_from_its_first_owner(keyed, scene_bytes):
-    scene = "/v1/scenes/patient-44"
-    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
-    body = {"scene": "demo", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
-    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200
-    assert keyed.http("admin", "PUT", ARM, json={**body, "scene": "patient-44"}).status_code == 200
+    if replaced:
+        assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200
+    assert keyed.http("admin", "PUT", ARM, json={**body, "scene": "patient-43"}).status_code == 200
     assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
     assert keyed.http("alice", "GET", ARM).json()["owner"] == "admin"
     assert keyed.http("bob", "DELETE", ARM).status_code == 404

@@ -123,15 +123,6 @@ def test_company_is_taken_in_turns(make_ticket):
     assert clients.count("polite") == 4
 
 
-def test_slow_frames_make_small_batches(make_ticket):
-    queue = queue_of(max_batch_poses=8)
-    for _ in range(20):
-        queue.add(make_ticket())
-    assert len(queue.take_batch()) == 4  # others wait 20 ms at the most, where frames are thought to take 5
-    rendered(queue, 1, frame_s=1.0)
-    assert len(queue.take_batch()) == 1
-
-
 def test_what_would_wait_for_others_too_long_is_refused_and_told_when_to_come_back(make_ticket):
     queue = queue_of(max_queue_s=0.5)
     queue.add(make_ticket())
