@@ -3,6 +3,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -53,6 +54,26 @@ Outputs planes_of(const std::array<OptionalPlanes, 6>& arrays, size_t count, int
         planes[k] = arrays[k]->data();
     }
     return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5], nullptr, nullptr, 0.0f};
+}
+
+using FieldArrays =
+    std::vector<std::pair<nb::ndarray<const float, nb::shape<-1, -1, -1, -1, 3>, nb::c_contig, nb::device::cpu>,
+                          nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>>>;
+
+// Coefficients [C or 1, X, Y, Z, 3] and maps to the grid [C or 1, 3, 4] of each displacement.
+Displacements displacements_of(const FieldArrays& arrays, size_t count) {
+    Displacements found;
+    for (const auto& [coefficients, to_grid] : arrays) {
+        const size_t fields = coefficients.shape(0), places = to_grid.shape(0);
+        if ((fields != 1 && fields != count) || (places != 1 && places != count))
+            throw std::invalid_argument("there must be one displacement, or one for each pose");
+        found.push_back({coefficients.data(),
+                         to_grid.data(),
+                         {int(coefficients.shape(1)), int(coefficients.shape(2)), int(coefficients.shape(3))},
+                         fields != 1,
+                         places != 1});
+    }
+    return found;
 }
 
 Beam beam_of(const BeamNumbers& numbers) { return {numbers[0], numbers[1], numbers[2], numbers[3]}; }
@@ -124,7 +145,7 @@ NB_MODULE(_cpu, m) {
            const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
            OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, std::optional<FreeGrey> grey,
            std::optional<FreeCounts> supported, float least_coverage, bool uncut, std::optional<int64_t> footprint_pixels,
-           std::optional<Flag> flag, int64_t number) {
+           std::optional<Flag> flag, int64_t number, const FieldArrays& displacements) {
             const size_t count = poses.shape(0);
             Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, count, height, width);
@@ -136,30 +157,35 @@ NB_MODULE(_cpu, m) {
             outputs.least_coverage = least_coverage;
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam), uncut};
             const Limits limits = limits_of(footprint_pixels, flag, number);
+            const Displacements moved = displacements_of(displacements, count);
             nb::gil_scoped_release release;
-            render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
-                   limits);
+            render(scene, probe, poses.data(), int(count), height, width, threads, instruction_set, outputs, limits, {},
+                   moved);
         },
         RENDER_ARGUMENTS, nb::arg("grey").noconvert().none() = nb::none(),
         nb::arg("supported").noconvert().none() = nb::none(), nb::arg("least_coverage") = 0.0f, nb::arg("uncut") = false,
-        nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
+        nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0,
+        nb::arg("displacements").noconvert() = FieldArrays{});
 
     m.def(
         "footprints",
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
-           const std::string& instruction_set, FreeCounts pixels, std::optional<Flag> flag, int64_t number) {
+           const std::string& instruction_set, FreeCounts pixels, std::optional<Flag> flag, int64_t number,
+           const FieldArrays& displacements) {
             if (pixels.shape(0) != poses.shape(0)) throw std::invalid_argument("there must be one count per pose");
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of({}, flag, number);
+            const Displacements moved = displacements_of(displacements, poses.shape(0));
             nb::gil_scoped_release release;
             footprints(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, limits,
-                       pixels.data());
+                       pixels.data(), moved);
         },
         nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
         nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"),
         nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("pixels").noconvert(),
-        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
+        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0,
+        nb::arg("displacements").noconvert() = FieldArrays{});
 
     m.def(
         "drawing_work",
@@ -185,21 +211,22 @@ NB_MODULE(_cpu, m) {
                double near_cm, double far_cm, double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width,
                int threads, const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo,
                OptionalPlanes transmittance, OptionalPlanes coverage, OptionalPlanes weight_sum,
-               OptionalPlanes intensity_sum) {
+               OptionalPlanes intensity_sum, const FieldArrays& displacements) {
                 const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum},
                                                   poses.shape(0), height, width);
                 const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
+                const Displacements moved = displacements_of(displacements, poses.shape(0));
                 nb::gil_scoped_release release;
                 new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
-                                     instruction_set, outputs);
+                                     instruction_set, outputs, moved);
             },
-            nb::keep_alive<1, 2>(), RENDER_ARGUMENTS)
+            nb::keep_alive<1, 2>(), RENDER_ARGUMENTS, nb::arg("displacements").noconvert() = FieldArrays{})
         .def(
             "differentiate",
             [](const Recording& self, int threads, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
                OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, FreeMatrix means,
                FreeMatrix scales, FreeMatrix quats, FreeVector transmittances, FreeVector sh0, FreeMatrix shn,
-               std::optional<FreeViews> views, FreeBeam beam) {
+               std::optional<FreeViews> views, FreeBeam beam, const std::vector<FreeFloats>& displacements) {
                 const Outputs gradients = planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum},
                                                     self.count(), self.height(), self.width());
                 const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
@@ -208,12 +235,22 @@ NB_MODULE(_cpu, m) {
                     throw std::invalid_argument("the gradients' shapes are not those of the parameters");
                 if (views && views->shape(0) != size_t(self.count()))
                     throw std::invalid_argument("there must be one gradient per view");
+                std::vector<float*> by_displacements;
+                for (const FreeFloats& one : displacements) by_displacements.push_back(one.data());
+                if (!displacements.empty() && displacements.size() != self.displacements().size())
+                    throw std::invalid_argument("there must be one gradient per displacement");
+                for (size_t f = 0; f < displacements.size(); ++f) {
+                    const Displacement& one = self.displacements()[f];
+                    if (displacements[f].size() != size_t(one.floats() * (one.has_many ? self.count() : 1)))
+                        throw std::invalid_argument(
+                            "the shape of a displacement's gradient is not that of its coefficients");
+                }
                 static_assert(sizeof(ViewGradient) == 6 * sizeof(double), "a shift and a turn, nothing between");
                 ViewGradient* by_views = views ? reinterpret_cast<ViewGradient*>(views->data()) : nullptr;
                 const RawGradients out{means.data(),          scales.data(), quats.data(),
                                        transmittances.data(), sh0.data(),    shn.data()};
                 nb::gil_scoped_release release;
-                const BeamMoments moments = self.differentiate(gradients, out, by_views, threads);
+                const BeamMoments moments = self.differentiate(gradients, out, by_views, by_displacements, threads);
                 beam.data()[0] = moments.zeroth, beam.data()[1] = moments.first, beam.data()[2] = moments.second;
             },
             nb::arg("threads"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),
@@ -221,7 +258,7 @@ NB_MODULE(_cpu, m) {
             nb::arg("weight_sum").noconvert().none(), nb::arg("intensity_sum").noconvert().none(),
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
             nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
-            nb::arg("views").noconvert().none(), nb::arg("beam").noconvert());
+            nb::arg("views").noconvert().none(), nb::arg("beam").noconvert(), nb::arg("displacements").noconvert());
 
     m.def(
         "image_loss",

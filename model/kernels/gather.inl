@@ -316,16 +316,16 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
 
 // From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards. In float, but with a beam:
 // then its terms, with fourth powers of scales, do not fit.
-template <bool thick>
+template <bool thick, bool displaced>
 inline void differentiate_slices(const SceneView& scene, const View& view, const Candidates& c, const SliceGradients& by,
                                  GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments,
-                                 ViewGradient* by_view) {
+                                 ViewGradient* by_view, float* const* by_fields) {
     using Reals = std::conditional_t<thick, Doubles, Floats>;
     const auto convert = [](auto vector) { return __builtin_convertvector(vector, Reals); };
     const auto take = [&](const float* p) { return convert(load<Floats>(p)); };
-    Placed<Reals> p = place<Reals>(scene, view, c);
+    Placed<Reals> p = place<Reals, displaced>(scene, view, c);
     Spread spread;
-    if constexpr (thick) spread = spread_along_elevation(view, p);
+    if constexpr (thick) spread = spread_along_elevation<displaced>(view, p);
     const Reals mean_x = take(by.mean_x), mean_z = take(by.mean_z), m2 = take(by.m2_plane);
     const Reals cov_xx = take(by.cov_xx), cov_xz = take(by.cov_xz), cov_zz = take(by.cov_zz);
     const Reals inverse = 1 / p.yy, height = p.mu[1] * inverse, tilt_x = p.xy * inverse, tilt_z = p.yz * inverse;
@@ -357,18 +357,36 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         for (int d = 0; d < 3; ++d) axes[a][d] = static_cast<Lane<Reals>>(view.axes[a][d]);
     const auto in_scene = [&](const Reals* v, int d) { return axes[0][d] * v[0] + axes[1][d] * v[1] + axes[2][d] * v[2]; };
     Reals by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
+    Reals by_map[3][3]{}, twist[3]{};      // of displaced tissue: by F, and the torque on its spokes
     for (int k = 0; k < 3; ++k) {
         const Reals* s = p.spoke[k];
         Reals by_spoke[3] = {2 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
                              2 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
                              2 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
         by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
-        if constexpr (thick) {  // the precision is the sum of (spoke / scale^2)^2 along elevation
+        if constexpr (thick && displaced) {  // the precision is eT S^-1 e
+            const Reals *n = spread.normal, pull = -2 * by_precision * (n[0] * s[0] + n[1] * s[1] + n[2] * s[2]);
+            for (int d = 0; d < 3; ++d) by_spoke[d] += pull * n[d];
+            by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
+        } else if constexpr (thick) {  // it is the sum of (spoke / scale^2)^2 along elevation
             const Reals pull = 2 * by_precision * s[1] / (p.scale[k] * p.scale[k] * p.scale[k] * p.scale[k]);
             by_spoke[1] += pull;
             by_log_scale[k] -= pull * s[1];
         }
-        for (int d = 0; d < 3; ++d) by_axes[d][k] = p.scale[k] * in_scene(by_spoke, d);
+        if constexpr (displaced) {
+            const Reals by_own[3] = {in_scene(by_spoke, 0), in_scene(by_spoke, 1), in_scene(by_spoke, 2)};
+            Reals own[3];  // the spoke in the scene's axes
+            for (int d = 0; d < 3; ++d)
+                own[d] = p.scale[k] * (p.map[d][0] * p.axes[0][k] + p.map[d][1] * p.axes[1][k] + p.map[d][2] * p.axes[2][k]);
+            for (int d = 0; d < 3; ++d) {
+                for (int e = 0; e < 3; ++e) by_map[d][e] += by_own[d] * p.scale[k] * p.axes[e][k];
+                const int e = (d + 1) % 3, f = (d + 2) % 3;
+                twist[d] += own[e] * by_own[f] - own[f] * by_own[e];
+                by_axes[d][k] = p.scale[k] * (p.map[0][d] * by_own[0] + p.map[1][d] * by_own[1] + p.map[2][d] * by_own[2]);
+            }
+        } else {
+            for (int d = 0; d < 3; ++d) by_axes[d][k] = p.scale[k] * in_scene(by_spoke, d);
+        }
     }
     const Reals w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
     const auto& m = by_axes;
@@ -388,8 +406,15 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
 
     const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
     for (int k = 0; k < c.count; ++k) {
+        float by_rest[3] = {float(by_mean[0][k]), float(by_mean[1][k]), float(by_mean[2][k])};
+        if constexpr (displaced) {
+            float by_lane[3][3];
+            for (int d = 0; d < 3; ++d)
+                for (int e = 0; e < 3; ++e) by_lane[d][e] = float(by_map[d][e][k]);
+            differentiate_displacement(view, scene.gaussians[c.ids[k]].mean, by_rest, by_lane, by_fields);
+        }
         GaussianGradient& to = gradients[c.ids[k]];
-        for (int d = 0; d < 3; ++d) to.mean[d] += float(by_mean[d][k]), to.log_scale[d] += float(by_log_scale[d][k]);
+        for (int d = 0; d < 3; ++d) to.mean[d] += by_rest[d], to.log_scale[d] += float(by_log_scale[d][k]);
         for (int d = 0; d < 4; ++d) to.quat[d] += float(by_quat[d][k]);
         to.absorb += scene.weighted ? -2.0f * by.m2_plane[k] : by.absorb[k];
         float* sh = sh_gradients + c.ids[k] * terms;
@@ -402,13 +427,20 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         const int e = (d + 1) % 3, f = (d + 2) % 3;
         const Reals spin = w * by_quat[d + 1] - p.quat[d + 1] * by_quat[0] + p.quat[e + 1] * by_quat[f + 1] -
                            p.quat[f + 1] * by_quat[e + 1];
-        const Reals turn = p.offset[e] * by_place[f] - p.offset[f] * by_place[e] + spin / 2;
+        const Reals torque = displaced ? twist[d] : spin / 2;
+        const Reals turn = p.offset[e] * by_place[f] - p.offset[f] * by_place[e] + torque;
         for (int k = 0; k < c.count; ++k) by_view->shift[d] -= by_mean[d][k], by_view->turn[d] -= turn[k];
     }
 }
 
 void gather(const SceneView& scene, const View& view, const Slice* slices, int64_t count, const PixelGradients& pixels,
-            GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments, ViewGradient* by_view) {
+            GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments, ViewGradient* by_view,
+            float* const* by_fields) {
+    const auto differentiate = [&](auto thick, const Candidates& c, const SliceGradients& by) {
+        (view.field_count
+             ? differentiate_slices<thick, true>
+             : differentiate_slices<thick, false>)(scene, view, c, by, gradients, sh_gradients, moments, by_view, by_fields);
+    };
     for (int64_t first = 0; first < count; first += kLanes) {
         Candidates c;
         SliceGradients by;
@@ -419,9 +451,9 @@ void gather(const SceneView& scene, const View& view, const Slice* slices, int64
             c.ids[c.count] = s.gaussian;
         }
         if (view.beam.is_thick())
-            differentiate_slices<true>(scene, view, c, by, gradients, sh_gradients, moments, by_view);
+            differentiate(std::true_type{}, c, by);
         else
-            differentiate_slices<false>(scene, view, c, by, gradients, sh_gradients, moments, by_view);
+            differentiate(std::false_type{}, c, by);
     }
 }
 

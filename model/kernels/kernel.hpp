@@ -50,7 +50,20 @@ struct Beam {
     bool is_thick() const { return at_focus > 0; }
 };
 
-// The gradient with respect to that variance, summed over slices, times powers of s - focus.
+inline constexpr int kMaxFields = 4;  // one after another
+
+// A smooth displacement of tissue: at grid coordinates g = to_grid (x, 1) the sum of coefficients times the cubic B-splines
+// around their places; beyond the outermost cells (1 to size - 2) as at the border.
+struct Field {
+    const float* coefficients;  // [X, Y, Z, 4] cm along the scene's axes, and 0
+    double to_grid[3][4];
+    int size[3];     // each at least 4
+    float steepest;  // bound of the norm of its gradient
+    int64_t place(int i, int j, int k) const { return 4 * ((int64_t(i) * size[1] + j) * size[2] + k); }
+    const float* at(int i, int j, int k) const { return coefficients + place(i, j, k); }
+};
+
+// The gradient with respect to a beam's variance, summed over slices, times powers of s - focus.
 struct BeamMoments {
     double zeroth, first, second;
 };
@@ -71,6 +84,10 @@ struct View {
     bool fanned;                 // the lines run from an apex at the origin, else side by side along z
     int height, lines;
     Beam beam;
+    const Field* fields;  // by which Gaussians are displaced, one after another
+    int field_count;
+    float stretch;                  // bound of how much farther two points come apart by them
+    float least_moved, most_moved;  // bounds of the displacement along elevation, cm
 };
 
 // A Gaussian cut by the image plane: a 2D Gaussian there, and what it adds.
@@ -221,11 +238,11 @@ struct Kernels {
     void (*count)(const View&, const Slice*, int64_t count, int first, int lines, Work&);  // of drawing a strip; added to
     void (*finish)(const View&, const Strip&, const Outputs&, const SavedPlanes&);
     // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K], the beam's moments and,
-    // where it is not null, the gradient by the view are added to.
+    // where they are not null, the gradients by the view and by the coefficients of its fields are added to.
     void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const Outputs& gradients,
                           const PixelGradients&);
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
-                   float* sh, BeamMoments&, ViewGradient*);
+                   float* sh, BeamMoments&, ViewGradient*, float* const* by_fields);
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
     // With a weight (not null) x is y + weight (x - y).
     ImageLoss (*image_loss)(const float* x, const float* y, const float* weight, int height, int width, const float* window,

@@ -64,6 +64,77 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     return view;
 }
 
+// The fields of some poses, packed as the kernels read them, with bounds of what they do.
+class Fields {
+ public:
+    // Throws std::invalid_argument for more than kMaxFields, and grids with fewer than four coefficients along an axis.
+    Fields(const Displacements& displacements, int first, int count) : each_(static_cast<int>(displacements.size())) {
+        if (each_ > kMaxFields) throw std::invalid_argument("tissue may be displaced by at most 4 fields");
+        for (const Displacement& one : displacements)
+            if (*std::min_element(one.size, one.size + 3) < 4)
+                throw std::invalid_argument("a field needs at least four coefficients along each axis");
+        for (int c = 0; each_ && c < count; ++c)
+            for (const Displacement& one : displacements) add(one, first + c);
+    }
+
+    void apply(View& view, int c) const {
+        view.fields = fields_.data() + int64_t(c) * each_;
+        view.field_count = each_;
+        double stretched = 1, least = 0, most = 0;
+        for (int f = 0; f < each_; ++f) {
+            const Field& field = view.fields[f];
+            stretched *= 1 + field.steepest;
+            float low = std::numeric_limits<float>::max(), high = -low;
+            for (int64_t i = 0; i < int64_t(field.size[0]) * field.size[1] * field.size[2]; ++i) {
+                float along = 0;
+                for (int d = 0; d < 3; ++d) along += float(view.axes[1][d]) * field.coefficients[4 * i + d];
+                low = std::min(low, along), high = std::max(high, along);
+            }
+            least += low, most += high;
+        }
+        const double slack = 1e-5 * (most - least);
+        view.stretch = static_cast<float>((stretched - 1) * (1 + 1e-5));
+        view.least_moved = static_cast<float>(least - slack), view.most_moved = static_cast<float>(most + slack);
+    }
+
+    int each() const { return each_; }
+
+ private:
+    void add(const Displacement& one, int pose) {
+        Field field{};
+        std::copy_n(one.size, 3, field.size);
+        std::copy_n(one.to_grid + (one.has_many_places ? 12 * pose : 0), 12, &field.to_grid[0][0]);
+        const int64_t floats = one.floats();
+        std::vector<float> packed(floats / 3 * 4);
+        const float* from = one.coefficients + (one.has_many ? floats * pose : 0);
+        for (int64_t i = 0; i < floats / 3; ++i) std::copy_n(from + 3 * i, 3, &packed[4 * i]);
+        field.coefficients = packed.data();
+        // Between neighbours along an axis of the grid a spline's slope is a mean of their differences.
+        double squares = 0;
+        for (int a = 0; a < 3; ++a) {
+            double longest = 0, per_cm = 0;
+            for (int e = 0; e < 3; ++e) per_cm += field.to_grid[a][e] * field.to_grid[a][e];
+            const int end[3] = {field.size[0] - (a == 0), field.size[1] - (a == 1), field.size[2] - (a == 2)};
+            for (int i = 0; i < end[0]; ++i)
+                for (int j = 0; j < end[1]; ++j)
+                    for (int k = 0; k < end[2]; ++k) {
+                        const float *here = field.at(i, j, k), *next = field.at(i + (a == 0), j + (a == 1), k + (a == 2));
+                        double step = 0;
+                        for (int d = 0; d < 3; ++d) step += double(next[d] - here[d]) * (next[d] - here[d]);
+                        longest = std::max(longest, step);
+                    }
+            squares += longest * per_cm;
+        }
+        field.steepest = static_cast<float>(std::sqrt(squares));
+        packed_.push_back(std::move(packed));
+        fields_.push_back(field);
+    }
+
+    int each_;  // of a pose
+    std::vector<std::vector<float>> packed_;
+    std::vector<Field> fields_;  // [poses, each]
+};
+
 // One allocation of the four accumulators of a strip.
 class StripBuffer {
  public:
@@ -86,14 +157,50 @@ class StripBuffer {
     float* floats_;
 };
 
+// Gradients by the coefficients of fields, of each part of the Gaussians and each pose.
+class FieldGradients {
+ public:
+    FieldGradients(const Displacements& displacements, const std::vector<float*>& out, int parts, int poses)
+        : displacements_(displacements), out_(out), poses_(poses) {
+        for (int place = 0; !out.empty() && place < parts * poses; ++place)
+            for (const Displacement& one : displacements) {
+                gradients_.emplace_back(one.floats() / 3 * 4);
+                pointers_.push_back(gradients_.back().data());
+            }
+    }
+
+    float* const* of(int part, int pose) const {
+        return out_.empty() ? nullptr : pointers_.data() + (int64_t(part) * poses_ + pose) * int64_t(out_.size());
+    }
+
+    void add_up() const {
+        for (size_t place = 0; place < gradients_.size(); ++place) {
+            const Displacement& one = displacements_[place % out_.size()];
+            const int64_t pose = int64_t(place / out_.size()) % poses_;
+            float* to = out_[place % out_.size()] + (one.has_many ? pose * one.floats() : 0);
+            for (int64_t i = 0; i < one.floats(); ++i) to[i] += gradients_[place][i / 3 * 4 + i % 3];
+        }
+    }
+
+ private:
+    const Displacements& displacements_;
+    const std::vector<float*>& out_;
+    int poses_;
+    std::vector<std::vector<float>> gradients_;  // [parts, poses, displacements]
+    std::vector<float*> pointers_;
+};
+
 // Some poses on their way from Gaussians to pixels.
 class Batch {
  public:
-    Batch(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-          const Kernels& kernels)
-        : kernels_(kernels), scene_(scene.view()), lines_(probe, width) {
-        for (int c = 0; c < count; ++c)
-            views_.push_back(make_view(probe, lines_, poses + 16 * c, height, width, !scene_.weighted));
+    // Of `count` poses from the `first` of all.
+    Batch(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int first, int count, int height,
+          int width, const Kernels& kernels, const Displacements& displacements = {})
+        : kernels_(kernels), scene_(scene.view()), lines_(probe, width), fields_(displacements, first, count) {
+        for (int c = 0; c < count; ++c) {
+            views_.push_back(make_view(probe, lines_, poses + 16 * (first + c), height, width, !scene_.weighted));
+            fields_.apply(views_.back(), c);
+        }
         slices_ = std::vector<SliceList>(int64_t(count) * parts());
     }
     Batch(const Batch&) = delete;
@@ -143,10 +250,12 @@ class Batch {
     }
 
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses. Views add up their
-    // parts in order, and so does the beam.
+    // parts in order, and so do the beam and the fields, whose gradients have the shape of their coefficients.
     BeamMoments differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
                               const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh,
-                              ViewGradient* views, int threads) const {
+                              ViewGradient* views, const Displacements& displacements,
+                              const std::vector<float*>& by_displacements, int threads) const {
+        const FieldGradients by_fields(displacements, by_displacements, parts(), count());
         std::vector<ViewGradient> by_part(views ? slices_.size() : 0);
         Phase by_pixel{count() * strips(), [&](int task) {
                            const int c = task / strips(), first = task % strips() * kStripLines;
@@ -160,10 +269,11 @@ class Batch {
                                   const int64_t place = int64_t(c) * parts() + part;
                                   const SliceList& list = slices_[place];
                                   kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh,
-                                                  moments[part], views ? &by_part[place] : nullptr);
+                                                  moments[part], views ? &by_part[place] : nullptr, by_fields.of(part, c));
                               }
                           }};
         run_phases({&by_pixel, &by_gaussian}, threads);
+        by_fields.add_up();
         for (size_t place = 0; place < by_part.size(); ++place) {
             ViewGradient& sum = views[place / parts()];
             for (int d = 0; d < 3; ++d) {
@@ -220,6 +330,7 @@ class Batch {
     const Kernels& kernels_;
     const SceneView scene_;
     const ScanLines lines_;
+    const Fields fields_;
     std::vector<View> views_;
     std::vector<SliceList> slices_;  // [poses, parts]
 };
@@ -271,20 +382,23 @@ std::vector<std::string> instruction_sets() {
 
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits,
-            const Lines& drawn) {
+            const Lines& drawn, const Displacements& displacements) {
     const Kernels& kernels = choose_kernels(instruction_set);
     const int64_t frame_size = int64_t(height) * width;
     for (int first = 0; first < count; first += kPosesAtOnce) {
-        Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
+        Batch batch(scene, probe, poses, first, std::min(kPosesAtOnce, count - first), height, width, kernels,
+                    displacements);
         batch.render(outputs.from(first, frame_size), {}, threads, limits, first, drawn);
     }
 }
 
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels) {
+                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels,
+                const Displacements& displacements) {
     const Kernels& kernels = choose_kernels(instruction_set);
     for (int first = 0; first < count; first += kPosesAtOnce) {
-        Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
+        Batch batch(scene, probe, poses, first, std::min(kPosesAtOnce, count - first), height, width, kernels,
+                    displacements);
         batch.footprints(pixels + first, threads, limits);
     }
 }
@@ -292,7 +406,7 @@ void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const do
 std::vector<Work> drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count,
                                int height, int width, int threads, const std::string& instruction_set) {
     if (count == 0) throw std::invalid_argument("there must be at least one pose");
-    Batch batch(scene, probe, poses, count, height, width, choose_kernels(instruction_set));
+    Batch batch(scene, probe, poses, 0, count, height, width, choose_kernels(instruction_set));
     return batch.work(threads);
 }
 
@@ -304,12 +418,13 @@ struct Recording::State {
 };
 
 Recording::Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                     int width, int threads, const std::string& instruction_set, const Outputs& outputs)
-    : scene_(scene), count_(count), height_(height), width_(width) {
+                     int width, int threads, const std::string& instruction_set, const Outputs& outputs,
+                     const Displacements& displacements)
+    : scene_(scene), count_(count), height_(height), width_(width), displacements_(displacements) {
     if (scene.order() == Order::Sorted) throw std::invalid_argument("a recording needs a scene in its given order");
     if (count == 0) return;
     const int stride = (width + kMaxLanes - 1) / kMaxLanes * kMaxLanes + kMaxLanes;
-    state_.reset(new State{{scene, probe, poses, count, height, width, choose_kernels(instruction_set)},
+    state_.reset(new State{{scene, probe, poses, 0, count, height, width, choose_kernels(instruction_set), displacements},
                            {count, 3, height, stride},
                            {},
                            stride});
@@ -326,7 +441,7 @@ int Recording::harmonics() const {
 }
 
 BeamMoments Recording::differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views,
-                                     int threads) const {
+                                     const std::vector<float*>& by_displacements, int threads) const {
     if (views) std::fill_n(views, count_, ViewGradient{});
     const SceneView scene = scene_.view();
     std::vector<GaussianGradient> gaussians(scene.count);
@@ -337,7 +452,8 @@ BeamMoments Recording::differentiate(const Outputs& gradients, const RawGradient
         std::vector<PixelGradients> pixels;
         for (int c = 0; c < count_; ++c)
             pixels.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), planes.at(c, 3), state_->stride});
-        moments = state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), views, threads);
+        moments = state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), views,
+                                              displacements_, by_displacements, threads);
     }
     scene_.to_raw(gaussians.data(), sh.data(), out, threads);
     return moments;

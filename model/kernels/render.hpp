@@ -21,6 +21,16 @@ struct ProbeGeometry {
     bool uncut = false;  // Gaussians count wherever their means lie
 };
 
+// A displacement of tissue (`Field`), the same for all poses or another for each.
+struct Displacement {
+    const float* coefficients;  // [C or 1, X, Y, Z, 3] cm
+    const double* to_grid;      // [C or 1, 3, 4]
+    int size[3];
+    bool has_many, has_many_places;  // C of them
+    int64_t floats() const { return int64_t(3) * size[0] * size[1] * size[2]; }
+};
+using Displacements = std::vector<Displacement>;  // one after another, at most kMaxFields
+
 // The scan lines that are drawn, of whole strips; the others' pixels are left as they are.
 struct Lines {
     int first = 0, end = std::numeric_limits<int>::max();
@@ -32,11 +42,12 @@ inline constexpr int kStripLines = 64;  // four accumulators of 512 rows stay wi
 // Throws GivenUp, TooCostly, std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits,
-            const Lines& drawn = {});
+            const Lines& drawn = {}, const Displacements& displacements = {});
 
 // The cost of each pose [C] in footprint pixels (footprint.hpp), without drawing it. Throws GivenUp, std::bad_alloc.
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels);
+                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels,
+                const Displacements& displacements = {});
 
 // What drawing each strip of scan lines of the poses takes, [C, strips], without drawing.
 std::vector<Work> drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count,
@@ -47,24 +58,28 @@ class Recording {
  public:
     // As `render`. Throws std::invalid_argument for a sorted scene: its gradients would come in another order.
     Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-              int threads, const std::string& instruction_set, const Outputs& outputs);
+              int threads, const std::string& instruction_set, const Outputs& outputs,
+              const Displacements& displacements = {});
     ~Recording();
 
     // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters,
-    // which are overwritten, and by the views [C] where they are wanted (not null); returns those with respect to the
-    // beam. The result does not depend on the number of threads.
-    BeamMoments differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const;
+    // which are overwritten, and by the views [C] and the coefficients of each displacement, zero before, where they are
+    // wanted (not null); returns those with respect to the beam. The result does not depend on the number of threads.
+    BeamMoments differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views,
+                              const std::vector<float*>& by_displacements, int threads) const;
 
     int count() const { return count_; }
     int height() const { return height_; }
     int width() const { return width_; }
     int64_t gaussian_count() const { return scene_.view().count; }
     int harmonics() const;  // K
+    const Displacements& displacements() const { return displacements_; }
 
  private:
     struct State;
     const PreparedScene& scene_;
     int count_, height_, width_;
+    Displacements displacements_;
     std::unique_ptr<State> state_;  // null for no poses
 };
 

@@ -3,6 +3,8 @@
 
 #pragma once
 
+#include "displace.inl"
+
 namespace {
 
 struct Candidates {
@@ -108,11 +110,12 @@ struct Placed {
     Reals mu[3];       // the mean, in the probe's axes
     Reals axes[3][3];  // columns: the Gaussian's own axes, in the scene's
     Reals scale[3];
+    Reals map[3][3];               // F of displaced tissue; its own axis times its scale becomes F times that
     Reals spoke[3][3];             // each own axis times its scale, in the probe's axes
     Reals xx, xy, xz, yy, yz, zz;  // covariance: the sum of the spokes' outer products
 };
 
-template <class Reals>
+template <class Reals, bool displaced>
 inline Placed<Reals> place(const SceneView& scene, const View& view, const Candidates& c) {
     float mean[3][kLanes], scale[3][kLanes], quat[4][kLanes];
     for (int k = 0; k < kLanes; ++k) {
@@ -123,10 +126,18 @@ inline Placed<Reals> place(const SceneView& scene, const View& view, const Candi
     const auto convert = [](auto vector) { return __builtin_convertvector(vector, Reals); };
     Placed<Reals> p;
     Doubles offset[3];  // a small difference of large numbers, and so are the mean's places
-    for (int d = 0; d < 3; ++d) {
-        offset[d] = __builtin_convertvector(load<Floats>(mean[d]), Doubles) - view.origin[d];
-        p.offset[d] = convert(offset[d]);
-    }
+    for (int d = 0; d < 3; ++d) offset[d] = __builtin_convertvector(load<Floats>(mean[d]), Doubles) - view.origin[d];
+    if constexpr (displaced)
+        for (int k = 0; k < kLanes; ++k) {
+            double x[3] = {mean[0][k], mean[1][k], mean[2][k]};
+            float map[3][3];
+            displace(view, x, map);
+            for (int d = 0; d < 3; ++d) {
+                offset[d][k] = x[d] - view.origin[d];
+                for (int e = 0; e < 3; ++e) p.map[d][e][k] = map[d][e];
+            }
+        }
+    for (int d = 0; d < 3; ++d) p.offset[d] = convert(offset[d]);
     for (int d = 0; d < 3; ++d)
         p.mu[d] = convert(view.axes[d][0] * offset[0] + view.axes[d][1] * offset[1] + view.axes[d][2] * offset[2]);
 
@@ -138,10 +149,14 @@ inline Placed<Reals> place(const SceneView& scene, const View& view, const Candi
     p.xx = p.xy = p.xz = p.yy = p.yz = p.zz = Reals{};
     for (int k = 0; k < 3; ++k) {
         p.scale[k] = convert(load<Floats>(scale[k]));
+        Reals own[3] = {p.axes[0][k], p.axes[1][k], p.axes[2][k]};
+        if constexpr (displaced)
+            for (int d = 0; d < 3; ++d)
+                own[d] = p.map[d][0] * p.axes[0][k] + p.map[d][1] * p.axes[1][k] + p.map[d][2] * p.axes[2][k];
         for (int d = 0; d < 3; ++d) {
             const Lane<Reals> along[3] = {Lane<Reals>(view.axes[d][0]), Lane<Reals>(view.axes[d][1]),
                                           Lane<Reals>(view.axes[d][2])};
-            p.spoke[k][d] = p.scale[k] * (along[0] * p.axes[0][k] + along[1] * p.axes[1][k] + along[2] * p.axes[2][k]);
+            p.spoke[k][d] = p.scale[k] * (along[0] * own[0] + along[1] * own[1] + along[2] * own[2]);
         }
         const Reals* s = p.spoke[k];
         p.xx += s[0] * s[0], p.xy += s[0] * s[1], p.xz += s[0] * s[2];
@@ -156,8 +171,10 @@ struct Spread {
     Doubles variance;   // there
     Doubles precision;  // eT S^-1 e
     Doubles ratio;      // |S'| / |S|
+    Doubles normal[3];  // S^-1 e, of displaced tissue
 };
 
+template <bool displaced>
 inline Spread spread_along_elevation(const View& view, Placed<Doubles>& p) {
     Spread t{};
     t.offset = p.mu[2];
@@ -165,9 +182,16 @@ inline Spread spread_along_elevation(const View& view, Placed<Doubles>& p) {
         for (int k = 0; k < kLanes; ++k) t.offset[k] = __builtin_sqrt(p.mu[0][k] * p.mu[0][k] + p.mu[2][k] * p.mu[2][k]);
     t.offset -= view.beam.focus;
     t.variance = view.beam.at_focus + view.beam.slope2 * t.offset * t.offset;
-    for (int k = 0; k < 3; ++k) {
-        const Doubles along = p.spoke[k][1] / (p.scale[k] * p.scale[k]);
-        t.precision += along * along;
+    if constexpr (displaced) {  // the spokes are not at right angles
+        const Doubles x = p.xz * p.yz - p.xy * p.zz, y = p.xx * p.zz - p.xz * p.xz, z = p.xy * p.xz - p.xx * p.yz;
+        const Doubles determinant = p.xy * x + p.yy * y + p.yz * z;
+        t.normal[0] = x / determinant, t.normal[1] = y / determinant, t.normal[2] = z / determinant;
+        t.precision = t.normal[1];
+    } else {
+        for (int k = 0; k < 3; ++k) {
+            const Doubles along = p.spoke[k][1] / (p.scale[k] * p.scale[k]);
+            t.precision += along * along;
+        }
     }
     t.ratio = 1.0 + t.variance * t.precision;
     p.yy += t.variance;
@@ -187,12 +211,12 @@ inline Direction direction_of(const Reals offset[3]) {
 }
 
 // Apart for a slice without thickness, so that it costs nothing there.
-template <bool thick>
+template <bool thick, bool displaced>
 void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
-    Placed<Doubles> p = place<Doubles>(scene, view, c);
+    Placed<Doubles> p = place<Doubles, displaced>(scene, view, c);
     Doubles lost{};  // what m2 grows by, as the beam's weight spreads, and by a Gaussian's own weight
     if (thick) {
-        const Spread spread = spread_along_elevation(view, p);
+        const Spread spread = spread_along_elevation<displaced>(view, p);
         for (int k = 0; k < c.count; ++k) lost[k] = __builtin_log(spread.ratio[k]);
     }
     if (scene.weighted)
@@ -239,7 +263,7 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     out.shrink_by(room - written);
 }
 
-template <bool thick>
+template <bool thick, bool displaced>
 void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
     const float ny[3] = {float(view.axes[1][0]), float(view.axes[1][1]), float(view.axes[1][2])};
     const float o[3] = {float(view.origin[0]), float(view.origin[1]), float(view.origin[2])};
@@ -248,7 +272,8 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
     const float slack = 1e-6f * (1.0f + far + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
     // A reach of 3.33 standard deviations; variances add up.
     const float beam_reach2 = float(kMaxM2 * (1 + 1e-5) * view.beam.most);
-    const auto reach_of = [beam_reach2](float reach) {
+    const auto reach_of = [beam_reach2, &view](float reach) {
+        if constexpr (displaced) reach *= 1 + view.stretch;
         return thick ? __builtin_sqrtf(reach * reach + beam_reach2) : reach;
     };
     Candidates found;
@@ -259,7 +284,19 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
             distance += ny[d] * (cluster.centre[d] - o[d]);
             extent += __builtin_fabsf(ny[d]) * cluster.half[d];
         }
-        if (__builtin_fabsf(distance) > extent) continue;
+        float moved = 0, doubt = 0;  // of all its Gaussians along elevation
+        if constexpr (displaced) {
+            if (distance + view.most_moved < -extent || distance + view.least_moved > extent) continue;
+            double x[3] = {cluster.centre[0], cluster.centre[1], cluster.centre[2]};
+            float map[3][3], squares = 0;
+            displace(view, x, map);
+            for (int d = 0; d < 3; ++d) {
+                moved += ny[d] * static_cast<float>(x[d] - cluster.centre[d]);
+                squares += cluster.half[d] * cluster.half[d];
+            }
+            doubt = view.stretch * __builtin_sqrtf(squares);
+        }
+        if (__builtin_fabsf(distance + moved) > extent + doubt) continue;
         const int64_t begin = i * kClusterSize;
         const int64_t end = begin + kClusterSize < scene.count ? begin + kClusterSize : scene.count;
         for (int64_t g = begin; g < end; ++g) {
@@ -267,21 +304,24 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
             float height = 0;
             for (int d = 0; d < 3; ++d) height += ny[d] * (gaussian.mean[d] - o[d]);
             found.ids[found.count] = g;
-            found.count += __builtin_fabsf(height) <= reach_of(gaussian.reach) + slack;
+            found.count += __builtin_fabsf(height + moved) <= reach_of(gaussian.reach) + slack + doubt;
             if (found.count == kLanes) {
-                slice_candidates<thick>(scene, view, found, out);
+                slice_candidates<thick, displaced>(scene, view, found, out);
                 found.count = 0;
             }
         }
     }
-    if (found.count > 0) slice_candidates<thick>(scene, view, found, out);
+    if (found.count > 0) slice_candidates<thick, displaced>(scene, view, found, out);
 }
 
 void slice_clusters(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
+    const auto slice = [&](auto thick) {
+        (view.field_count ? slice_clusters_of<thick, true> : slice_clusters_of<thick, false>)(scene, view, first, last, out);
+    };
     if (view.beam.is_thick())
-        slice_clusters_of<true>(scene, view, first, last, out);
+        slice(std::true_type{});
     else
-        slice_clusters_of<false>(scene, view, first, last, out);
+        slice(std::false_type{});
 }
 
 }  // namespace

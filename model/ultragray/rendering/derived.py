@@ -97,7 +97,7 @@ class Drawing:
 
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""
-        return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
+        return self._draw(part.under(*self.scene.displacements), *self._view, (name,), self._limits, self._beam)[name]
 
     def mark_tools(self, labels: Tensor) -> None:
         """Puts the labels of tools into labels [C, H, W], where they are."""
@@ -172,9 +172,10 @@ def recorded_part(scene: GaussianScene) -> GaussianScene | None:
         kept = ~torch.isin(labels, labels.new_tensor(scene.info.made_labels))
         splats: dict[str, Any] = {name: raw.detach()[kept] for name, raw in scene.splats.items()}
         info = replace(scene.info, gaussian_count=int(kept.sum()), label_names={})
-        return replace(scene, **splats, labels=None, info=info) if kept.any() else None
+        return replace(scene.under(), **splats, labels=None, info=info) if kept.any() else None
 
-    return scene.prepared("recorded", chosen)
+    part = scene.prepared("recorded", chosen)
+    return None if part is None else part.under(*scene.displacements)
 
 
 # The expected standard deviation of a pixel's error, from the planes rendered around it and the distances of views.

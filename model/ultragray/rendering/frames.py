@@ -121,6 +121,7 @@ def render(
     )
     chosen_backend = choose_backend(backend, scene)
     draw = BACKENDS[chosen_backend].draw
+    scene.check_displacements(len(view[1]))
     speckle_by = chosen_backend if _checked_speckle(speckle, scene) is Speckle.NATURAL else None
     contact = _checked_contact(contact)
     planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
@@ -129,7 +130,8 @@ def render(
     for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
         shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
         sight = _tools_in_view(tools, view, poses, slice(first, first + len(seen[1])), shown)
-        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost, speckle_by)
+        some = scene.under(*(one.of(slice(first, first + len(seen[1]))) for one in scene.displacements))
+        drawing = Drawing(draw, some, seen, limits.after(first), shown, touching, sight, ghost, speckle_by)
         drawing.draw(planes)
         drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
     whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}

@@ -29,6 +29,7 @@ from ultragray.scene.compressed import (
     part_name,
     unpack,
 )
+from ultragray.scene.deformation import MAX_FIELDS, Displacement
 from ultragray.scene.info import (
     BESIDE,
     LABELS_TENSOR,
@@ -83,6 +84,7 @@ class GaussianScene:
     labels: Tensor | None = None  # [N] uint8
     pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
     rest_poses: FloatArray | None = None  # [P, 4, 4] mm: where the tissue at rest looks as training frames do
+    displacements: tuple[Displacement, ...] = ()  # of its tissue, see `under`; no part of the file
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -229,8 +231,38 @@ class GaussianScene:
             return self
         info = replace(self.info, tissue_shares=None)
         return self.prepared(
-            "at rest", lambda: replace(self, info=info, training_poses=rest, rest_poses=None, pose_corrections=None)
-        )
+            "at rest",
+            lambda: replace(self.under(), info=info, training_poses=rest, rest_poses=None, pose_corrections=None),
+        ).under(*self.displacements)
+
+    def under(self, *displacements: Displacement) -> GaussianScene:
+        """The scene with its tissue displaced by these alone, one after another (`ultragray.scene.deformation`); it
+        shares what was prepared of the scene at rest.
+
+        Raises InvalidArgument for more than MAX_FIELDS.
+        """
+        if len(displacements) > MAX_FIELDS:
+            raise InvalidArgument(
+                f"tissue may be displaced by at most {MAX_FIELDS} fields, got {len(displacements)}",
+                field="displacements",
+            )
+        moved = replace(self, displacements=displacements)
+        moved._prepared = self._prepared
+        return moved
+
+    def check_displacements(self, pose_count: int) -> None:
+        """Raises InvalidArgument where a displacement is neither for all poses of a call nor has one for each."""
+        for one in self.displacements:
+            if not {len(one.coefficients), len(one.to_grid)} <= {1, pose_count}:
+                raise InvalidArgument(
+                    f"a displacement must be one, or one for each of {pose_count} poses, got "
+                    f"{len(one.coefficients)} of coefficients and {len(one.to_grid)} of places",
+                    field="displacements",
+                )
+
+    def displacements_cm(self) -> tuple[Displacement, ...]:
+        """Those of the tissue in the scene's own frame (cm, about its centre)."""
+        return tuple(one.in_cm(self.info.centre_mm) for one in self.displacements)
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
         """Poses in the tissue at rest (mm) as poses in the scene's own frame (cm, about its centre)."""

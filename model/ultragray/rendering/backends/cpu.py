@@ -29,6 +29,7 @@ from ultragray.rendering.backends.inputs import (
 )
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
 from ultragray.rendering.outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
+from ultragray.scene.deformation import Displacement
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -63,19 +64,22 @@ def render_outputs(
             field="instruction_set",
         )
     view = {**_view_arguments(probe, as_array(poses_cm), height, width, beam), "instruction_set": instruction_set}
-    varied = [*scene.splats.values(), *([] if beam is None else [beam])]
+    fields = scene.displacements_cm()
+    varied = [*scene.splats.values(), *(one.coefficients for one in fields), *([] if beam is None else [beam])]
     if want_gradient(poses_cm) or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
             Kind(scene.info.intensity, weighted),
             view,
+            [one.to_grid for one in fields],
             tuple(outputs),
             poses_cm,
             beam,
             *scene.splats.values(),
+            *(one.coefficients for one in fields),
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    _draw(_sorted(scene, weighted), view, planes, limits)
+    _draw(scene, view, planes, limits, weighted=weighted)
     return planes
 
 
@@ -99,8 +103,8 @@ def render_grey(
     view = {**_view_arguments(probe, poses_cm, height, width, beam), "instruction_set": instruction_set}
     grey = np.empty((len(poses_cm), height, width), np.uint8)  # each call of torch's would cost a frame 30 to 100 µs
     supported = np.zeros(len(poses_cm), np.int64)
-    counted = {"grey": grey, "supported": supported, "least_coverage": least_coverage}
-    _draw(_sorted(scene), view, {}, limits, **counted)
+    counted: dict[str, Any] = {"grey": grey, "supported": supported, "least_coverage": least_coverage}
+    _draw(scene, view, {}, limits, **counted)
     return torch.from_numpy(grey), (supported / (height * width)).astype(np.float32)
 
 
@@ -120,17 +124,39 @@ def plane_sums(
     probe = LinearProbe(10.0 * spacing_cm * columns, 0.0, 10.0 * spacing_cm * rows)
     view = _view_arguments(probe, corners_cm, rows, columns, None) | {"start": 0.0, "instruction_set": "auto"}
     planes = _empty_planes(view, SUMS)
-    _draw(_sorted(scene, weighted=True), view, planes, limits, uncut=True)
+    _draw(scene, view, planes, limits, weighted=True, uncut=True)
     return planes[WEIGHT_SUM], planes[INTENSITY_SUM]
 
 
 def _draw(
-    scene: _cpu.PreparedScene, view: dict[str, Any], planes: dict[str, Tensor], limits: Limits, **more: Any
+    scene: GaussianScene,
+    view: dict[str, Any],
+    planes: dict[str, Tensor],
+    limits: Limits,
+    *,
+    weighted: bool = False,
+    **more: Any,
 ) -> None:
     """Has the kernel fill planes [C, H, W], and what `more` asks for. Raises FrameTooCostly, GivenUp."""
     bounds = {"footprint_pixels": limits.footprint_pixels, "flag": limits.flag, "number": limits.number}
     with _limited(limits):
-        _cpu.render(scene, **view, **_arrays(planes), **bounds, **more)
+        _cpu.render(
+            _sorted(scene, weighted),
+            **view,
+            **_arrays(planes),
+            **bounds,
+            displacements=_fields(scene.displacements_cm()),
+            **more,
+        )
+
+
+def _fields(displacements: Sequence[Displacement]) -> list[tuple[npt.NDArray[np.float32], FloatArray]]:
+    """Displacements (cm) as the kernel takes them."""
+    return [(_coefficients(one.coefficients).numpy(), np.ascontiguousarray(one.to_grid)) for one in displacements]
+
+
+def _coefficients(of_any_type: Tensor) -> Tensor:
+    return of_any_type.detach().to("cpu", torch.float32).contiguous()
 
 
 @contextmanager
@@ -166,6 +192,7 @@ def footprint_pixels(
             pixels=pixels,
             flag=limits.flag,
             number=limits.number,
+            displacements=_fields(scene.displacements_cm()),
         )
     return pixels.tolist()
 
@@ -228,14 +255,18 @@ class _Render(torch.autograd.Function):
         ctx: Any,
         kind: Kind,
         view: dict[str, Any],
+        to_grids: list[FloatArray],
         names: tuple[str, ...],
         poses: ScenePoses,
         beam: Tensor | None,
-        *splats: Tensor,
+        *varied: Tensor,  # raw parameters, and the coefficients of each displacement (cm)
     ) -> tuple[Tensor, ...]:
         planes = _empty_planes(view, names)
+        splats, coefficients = varied[: len(PARAMETERS)], varied[len(PARAMETERS) :]
         scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), kind, as_given=True)
-        ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
+        fields = _fields([Displacement(*one) for one in zip(coefficients, to_grids, strict=True)])
+        ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes), displacements=fields)
+        ctx.fields = coefficients if any(ctx.needs_input_grad[6 + len(PARAMETERS) :]) else ()
         ctx.names, ctx.poses = names, poses
         ctx.shapes = [tensor.shape for tensor in splats]
         ctx.beam = beam.detach() if beam is not None and beam.requires_grad else None
@@ -253,7 +284,8 @@ class _Render(torch.autograd.Function):
         means, scales, quats, transmittances, sh0, shn = (
             torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
         )
-        views = torch.empty((len(ctx.poses), 2, 3), dtype=torch.float64) if ctx.needs_input_grad[3] else None
+        views = torch.empty((len(ctx.poses), 2, 3), dtype=torch.float64) if ctx.needs_input_grad[4] else None
+        fields = [torch.zeros(one.shape, dtype=torch.float32) for one in ctx.fields]
         moments = np.empty(3)
         ctx.recording.differentiate(
             threads=torch.get_num_threads(),
@@ -266,10 +298,17 @@ class _Render(torch.autograd.Function):
             shn=shn.squeeze(-1).numpy(),
             views=None if views is None else views.numpy(),
             beam=moments,
+            displacements=[one.numpy() for one in fields],
         )
+        by_fields: list[Tensor | None] = [None] * (len(ctx.needs_input_grad) - 6 - len(PARAMETERS))
+        by_fields[: len(fields)] = [by.to(one) for by, one in zip(fields, ctx.fields, strict=True)]
         by_poses = None if views is None else gradient_by_poses(ctx.poses.detach(), views)
         by_beam = None if ctx.beam is None else Moments(*moments.tolist()).gradient(ctx.beam)
-        return (None, None, None, by_poses, by_beam, means, scales, quats, transmittances, sh0, shn)
+        return (
+            *(None, None, None, None, by_poses, by_beam),
+            *(means, scales, quats, transmittances, sh0, shn),
+            *by_fields,
+        )
 
 
 def _prepare(splats: Mapping[str, Tensor], kind: Kind, *, as_given: bool = False) -> _cpu.PreparedScene:

@@ -19,6 +19,7 @@ from ultragray.rendering.backends.cpu import footprint_pixels
 from ultragray.rendering.backends.inputs import KernelLines, ScenePoses, as_array
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import INTENSITY_SUM, WEIGHT_SUM
+from ultragray.scene.deformation import displaced
 from ultragray.scene.gaussians import GaussianScene
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
@@ -53,7 +54,10 @@ def render_outputs(
     if limits.footprint_pixels is not None:
         limits.check_costs(footprint_pixels(scene, probe, as_array(poses_cm), height, width, limits, beam))
     poses = torch.as_tensor(poses_cm).to(scene.means)
-    views = [combine(_render_pose(scene, probe, pose, height, width, limits, beam, weighted)) for pose in poses]
+    views = [
+        combine(_render_pose(scene, place, probe, pose, height, width, limits, beam, weighted))
+        for place, pose in enumerate(poses)
+    ]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 
@@ -74,6 +78,7 @@ def combine(fields: Fields) -> dict[str, Tensor]:
 
 def _render_pose(
     scene: GaussianScene,
+    place: int,  # of the pose among those of the call
     probe: Probe,
     pose: Tensor,
     height: int,
@@ -84,15 +89,19 @@ def _render_pose(
 ) -> Fields:  # [H, W] each
     like = scene.means
     rotation, origin = pose[:3, :3], pose[:3, 3]
-    means = (scene.means - origin) @ rotation  # [N, 3] probe frame
-    inverse_root = inverse_root_covariance(scene, rotation)  # [N, 3, 3]
+    inside, into_gaussian = scene.means, rotation  # [N, 3] in the scene; [3, 3], or [N, 3, 3] F⁻¹·rotation
+    if scene.displacements:
+        inside, map_at_means = displaced(inside, scene.displacements_cm(), place)
+        into_gaussian = torch.linalg.solve(map_at_means, rotation.expand_as(map_at_means))
+    means = (inside - origin) @ rotation  # [N, 3] probe frame
+    inverse_root = inverse_root_covariance(scene, into_gaussian)  # [N, 3, 3]
     lost = None  # [N] what m² grows by: ln(|Σ'|/|Σ|) of a beam, −2·ln(weight) of a weighted Gaussian
     if beam is not None:
         inverse_root, lost = _spread_along_elevation(inverse_root, _beam_variance(beam.to(like), probe, means))
     if weighted:
         by_weight = -2.0 * torch.nn.functional.logsigmoid(scene.transmittances)
         lost = by_weight if lost is None else lost + by_weight
-    intensities = intensity(scene, origin)  # [N]
+    intensities = intensity(scene, origin, inside)  # [N]
     tau = torch.sigmoid(scene.transmittances)  # [N]
     origins, directions = (like.new_tensor(v) for v in probe.scan_lines(width))  # [W, 3] mm, [W, 3]
     origins = origins / 10.0
@@ -125,7 +134,7 @@ def _render_pose(
     return Fields(weight_sum, weighted_intensity, transmittance)
 
 
-def inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]
+def inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [3, 3] or [N, 3, 3] -> [N, 3, 3]
     """L with LᵀL = A = Σ⁻¹ in the probe frame: rotate into the Gaussian's own axes, divide by its scales."""
     w, x, y, z = (scene.quats / scene.quats.norm(dim=-1, keepdim=True)).unbind(-1)
     axes = torch.stack(
@@ -199,9 +208,12 @@ def _weight_and_alpha(rays: Rays, depths: Tensor) -> tuple[Tensor, Tensor]:  # [
     return weight, alpha
 
 
-def intensity(scene: GaussianScene, origin: Tensor) -> Tensor:  # [3] cm -> [N]
-    """Echo intensity I of each Gaussian seen from a probe at `origin`, by its activation (docs/physics.md §2)."""
-    offset = scene.means - origin
+def intensity(scene: GaussianScene, origin: Tensor, means: Tensor | None = None) -> Tensor:  # [3], [N, 3] cm -> [N]
+    """Echo intensity I of each Gaussian seen from a probe at `origin`, by its activation (docs/physics.md §2).
+
+    `means`: where displaced tissue has them.
+    """
+    offset = (scene.means if means is None else means) - origin
     length = offset.norm(dim=-1, keepdim=True)
     v = torch.where(length > 0, offset / torch.where(length > 0, length, 1.0), 0.0)
     coefficients = torch.cat([scene.sh0, scene.shN], dim=1)[..., 0]  # [N, K]

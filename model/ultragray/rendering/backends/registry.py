@@ -72,6 +72,8 @@ def choose_backend(name: str, scene: GaussianScene) -> str:
         raise BackendUnavailable(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}", field="backend")
     backend = BACKENDS[name]
     backend.require()
+    if name == "cuda" and scene.displacements:
+        raise BackendUnavailable("backend cuda draws tissue at rest alone: ask for auto, or reference", field="backend")
     if not backend.supports(scene):
         raise BackendUnavailable(
             f"backend {name} renders float32 scenes {backend.place()}, got {scene.means.dtype} on {scene.means.device}",

@@ -61,9 +61,15 @@ def device(index: int = 0) -> torch.device:
 
 
 def supports(scene: GaussianScene) -> bool:
-    """Whether the backend can render the scene: float32 on a CUDA device, or on the CPU where it is interpreted."""
+    """Whether the backend can render the scene: float32 on a CUDA device, or on the CPU where it is interpreted, its
+    tissue at rest."""
     wanted = "cpu" if interpreted() else "cuda"
-    return scene.means.device.type == wanted and scene.means.dtype == torch.float32 and available()
+    return (
+        not scene.displacements
+        and scene.means.device.type == wanted
+        and scene.means.dtype == torch.float32
+        and available()
+    )
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
