@@ -85,7 +85,13 @@ export type Order = (typeof ORDERS)[number];
 export type Against = { way: Measured } | { scene: string };
 
 const POLL_MS = 700;
-const SCENE = "scene:";
+export const SCENE = "scene:";
+
+/** What an address or a choice names: a scene, or else a way; what is none is the rendering. */
+export function againstOf(name: string): Against {
+  if (name.startsWith(SCENE)) return { scene: name.slice(SCENE.length) };
+  return { way: MEASURED.find((one) => one === name) ?? "rendering" };
+}
 
 /** What Compare looks at: the frame, what it is compared with, how, and where the pictures are enlarged. */
 export class Bench {
@@ -97,6 +103,8 @@ export class Bench {
   #wanted = $state(0);
   metric = $state<Metric>("psnr_db");
   against = $state.raw<Against>({ way: "rendering" });
+  /** Its name. */
+  readonly other = $derived("scene" in this.against ? SCENE + this.against.scene : this.against.way);
   mode = $state<Mode>("side");
   order = $state<Order>("sweep");
   #attempts = $state(0);
@@ -157,7 +165,7 @@ export class Bench {
     router.keep({
       frame: this.index === 0 ? null : String(this.index),
       metric: this.metric === "psnr_db" ? null : this.metric,
-      with: "scene" in this.against ? SCENE + this.against.scene : this.way === "rendering" ? null : this.way,
+      with: this.other === "rendering" ? null : this.other,
       look: this.mode === "side" ? null : this.mode,
       order: this.order === "sweep" ? null : this.order,
     });
@@ -170,7 +178,6 @@ export class Bench {
     this.metric = METRICS.find((one) => one === metric) ?? "psnr_db";
     this.mode = MODES.find((one) => one === look) ?? "side";
     this.order = ORDERS.find((one) => one === order) ?? "sweep";
-    const way = MEASURED.find((one) => one === other);
-    this.against = other.startsWith(SCENE) ? { scene: other.slice(SCENE.length) } : { way: way ?? "rendering" };
+    this.against = againstOf(other);
   }
 }

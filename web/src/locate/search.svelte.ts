@@ -6,7 +6,7 @@ import { localize, type Located, renderPicture, WITHIN, type Within } from "../a
 import { areUpright } from "../geometry/plane";
 import type { Pose } from "../geometry/pose";
 import { besideSession, type Session } from "../session/session.svelte";
-import { base64 } from "../shared/asking.svelte";
+import { Attempt, base64 } from "../shared/asking.svelte";
 import { words } from "../words/words.svelte";
 
 const PNG = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
@@ -59,19 +59,18 @@ function looksLikeFan({ data, width, height }: ImageData): boolean {
 }
 
 /** A search for where a real frame was taken, kept while other views are shown. */
-export class Search {
+export class Search extends Attempt {
   within = $state.raw(Object.fromEntries(WITHIN.map(({ name, field }) => [name, field.default])) as unknown as Within);
   frame = $state.raw<RealFrame | null>(null);
   /** Addresses of the given frame and of the scene at the pose that was found. */
   given = $state<string | null>(null);
   rendered = $state<string | null>(null);
   located = $state.raw<Located | null>(null);
-  isRunning = $state(false);
-  problem = $state<string | null>(null);
-  #ending = new AbortController();
   #newest: File | null = null;
 
-  constructor(private readonly session: Session) {}
+  constructor(private readonly session: Session) {
+    super();
+  }
 
   get pose(): Pose | null {
     return this.located && this.located.pose.flat();
@@ -98,27 +97,13 @@ export class Search {
   async start(): Promise<void> {
     if (this.frame === null) return;
     const { session, within, frame } = this;
-    this.stop();
     this.#forgetResult();
-    this.problem = null;
-    this.isRunning = true;
-    const { signal } = (this.#ending = new AbortController());
-    try {
+    await this.run(async (signal) => {
       const [start, probe] = [session.pose, session.chosenProbe];
-      const located = await localize(session.name, { image: base64(frame.bytes), start, probe, ...within }, signal);
-      this.located = located;
-      const { picture } = await renderPicture(session.name, located.pose.flat(), { probe }, signal);
+      this.located = await localize(session.name, { image: base64(frame.bytes), start, probe, ...within }, signal);
+      const { picture } = await renderPicture(session.name, this.located.pose.flat(), { probe }, signal);
       this.#replace("rendered", picture);
-    } catch (error) {
-      if (!signal.aborted) this.problem = explain(error);
-    } finally {
-      if (!signal.aborted) this.isRunning = false;
-    }
-  }
-
-  stop(): void {
-    this.#ending.abort();
-    this.isRunning = false;
+    });
   }
 
   #forgetResult(): void {

@@ -80,8 +80,37 @@ export class Polled<Answer> {
   }
 }
 
+/** Something that is tried at a press: whether it is under way, and why it came to nothing. */
+export class Attempt {
+  busy = $state(false);
+  problem = $state<string | null>(null);
+  #ending = new AbortController();
+
+  /** Tries it, in place of what is still tried; false where it came to nothing, or was stopped. */
+  async run(work: (signal: AbortSignal) => Promise<unknown>): Promise<boolean> {
+    this.stop();
+    const { signal } = (this.#ending = new AbortController());
+    this.busy = true;
+    this.problem = null;
+    try {
+      await work(signal);
+      return true;
+    } catch (error) {
+      if (!signal.aborted) this.problem = explain(error);
+      return false;
+    } finally {
+      if (!signal.aborted) this.busy = false;
+    }
+  }
+
+  stop(): void {
+    this.#ending.abort();
+    this.busy = false;
+  }
+}
+
 /** Files on their way to the service. They outlive the view that sends them; leaving the page asks first. */
-export abstract class Sending {
+export abstract class Sending extends Attempt {
   /** Those that are under way, or were not taken, for who looks at another view. */
   static readonly all = new SvelteSet<Sending>();
   /** The view that sends it, and what it will be called. */
@@ -89,34 +118,21 @@ export abstract class Sending {
   abstract name: string;
   /** Share of the bytes that were sent, 0 to 1; null: nothing is under way. */
   share = $state<number | null>(null);
-  /** Why the last one was not taken. */
-  problem = $state<string | null>(null);
-  #ending = new AbortController();
-
-  stop(): void {
-    this.#ending.abort();
-  }
 
   /** Sends one; null where it was stopped or refused. */
   protected async transfer<Answer>(
     send: (told: Told, signal: AbortSignal) => Promise<Answer>,
   ): Promise<Answer | null> {
-    const { signal } = (this.#ending = new AbortController());
+    let answer: Answer | null = null;
     const ask = (event: BeforeUnloadEvent): void => event.preventDefault();
     addEventListener("beforeunload", ask);
-    this.problem = null;
     this.share = 0;
     Sending.all.add(this);
-    try {
-      return await send((share) => (this.share = share), signal);
-    } catch (error) {
-      if (!signal.aborted) this.problem = explain(error);
-      return null;
-    } finally {
-      this.share = null;
-      if (this.problem === null) Sending.all.delete(this);
-      removeEventListener("beforeunload", ask);
-    }
+    await this.run(async (signal) => (answer = await send((share) => (this.share = share), signal)));
+    this.share = null;
+    if (this.problem === null) Sending.all.delete(this);
+    removeEventListener("beforeunload", ask);
+    return answer;
   }
 }
 
@@ -139,27 +155,6 @@ export function base64(bytes: Uint8Array): string {
   const pieces: string[] = [];
   for (let start = 0; start < bytes.length; start += PIECE) pieces.push(String.fromCharCode(...bytes.subarray(start, start + PIECE)));
   return btoa(pieces.join(""));
-}
-
-/** Something that is tried at a press: whether it is under way, and why it came to nothing. */
-export class Attempt {
-  busy = $state(false);
-  problem = $state<string | null>(null);
-
-  /** Tries it; false where it came to nothing. */
-  async run(work: () => Promise<unknown>): Promise<boolean> {
-    this.busy = true;
-    this.problem = null;
-    try {
-      await work();
-      return true;
-    } catch (error) {
-      this.problem = explain(error);
-      return false;
-    } finally {
-      this.busy = false;
-    }
-  }
 }
 
 /** A list of the service that is asked for while somebody looks; answers that come too late are left. */
