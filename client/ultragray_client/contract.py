@@ -20,6 +20,7 @@ __all__ = [
     "Below",
     "Box",
     "BoxShape",
+    "Breathing",
     "ClockOffset",
     "CompareJob",
     "ComparisonSettings",
@@ -222,6 +223,14 @@ class Needle(Shaft):
 Tool: TypeAlias = Box | Cylinder | Needle
 
 
+@dataclass(frozen=True)
+class Breathing:
+    """Regular breathing by the service's clock: the number of the first mode goes from end to end and back."""
+
+    period_s: float = 4.0  # Of one breath.
+    depth: float = 1.0  # Share of the range that was seen, from its low end.
+
+
 class Speckle(str, Enum):
     """The speckle of a frame (`ultragray.rendering.speckle`)."""
 
@@ -269,6 +278,10 @@ class FrameSettings:
     # Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
     # before it. Default: 0.
     ghost: float | None = None
+    # Numbers of the scene's modes of motion, one each. Default: tissue is at rest.
+    phase: tuple[float, ...] | None = None
+    # The first mode breathes by the service's clock; frames tell the phase that they were drawn with.
+    breathing: Breathing | None = None
     # natural: bmode has the speckle that scatterers in the tissue give a scanner's frames. Other outputs are as
     # without.
     speckle: Speckle = Speckle.OFF
@@ -308,6 +321,7 @@ class Additions:
     contact: Contact | None = None  # As used; null: it was assumed.
     tools: tuple[Tool, ...] = ()  # As used.
     ghost: float = 0.0  # As used; 0: none.
+    phase: tuple[float, ...] = ()  # Numbers of the scene's modes of motion, as used; empty: at rest.
     speckle: Speckle = Speckle.OFF  # As used.
     registration: str | None = None  # That led the pose into the scene; null: none, it was sent as it is.
 

@@ -412,6 +412,22 @@ namespace Ultragray
         }
     }
 
+    /// <summary>Regular breathing by the service's clock: the number of the first mode goes from end to end and back.</summary>
+    public sealed class Breathing : IWritable
+    {
+        /// <summary>Of one breath.</summary>
+        public double PeriodS { get; set; } = 4.0;
+        /// <summary>Share of the range that was seen, from its low end.</summary>
+        public double Depth { get; set; } = 1.0;
+        public void Write(JsonWriter json)
+        {
+            json.Open('{');
+            json.Member("period_s", PeriodS);
+            json.Member("depth", Depth);
+            json.Close('}');
+        }
+    }
+
     /// <summary>The speckle of a frame (`ultragray.rendering.speckle`).</summary>
     public enum Speckle
     {
@@ -497,6 +513,10 @@ namespace Ultragray
         public Tool[] Tools { get; set; }
         /// <summary>Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies before it. Default: 0.</summary>
         public double? Ghost { get; set; }
+        /// <summary>Numbers of the scene's modes of motion, one each. Default: tissue is at rest.</summary>
+        public double[] Phase { get; set; }
+        /// <summary>The first mode breathes by the service's clock; frames tell the phase that they were drawn with.</summary>
+        public Breathing Breathing { get; set; }
         /// <summary>natural: bmode has the speckle that scatterers in the tissue give a scanner's frames. Other outputs are as without.</summary>
         public Speckle Speckle { get; set; } = Speckle.Off;
         /// <summary>Gain, depth, scan conversion ...; default: as rendered.</summary>
@@ -514,6 +534,8 @@ namespace Ultragray
             json.Member("contact", Contact == null ? null : Words.Contact[(int)Contact.Value]);
             json.Member("tools", Tools);
             json.Member("ghost", Ghost);
+            json.Member("phase", Phase);
+            json.Member("breathing", Breathing);
             json.Member("speckle", Words.Speckle[(int)Speckle]);
             json.Member("display", Display);
             json.Member("outputs", Outputs);
@@ -724,6 +746,8 @@ namespace Ultragray
         public Tool[] Tools { get; set; }
         /// <summary>As used; 0: none.</summary>
         public double Ghost { get; set; }
+        /// <summary>Numbers of the scene's modes of motion, as used; empty: at rest.</summary>
+        public double[] Phase { get; set; }
         /// <summary>As used.</summary>
         public Speckle Speckle { get; set; } = Speckle.Off;
         /// <summary>That led the pose into the scene; null: none, it was sent as it is.</summary>
@@ -776,6 +800,7 @@ namespace Ultragray
                 else if (json.Named("contact")) Contact = json.IsNull() ? null : (Contact?)json.Word(Words.Contact);
                 else if (json.Named("tools")) Tools = json.Elements(Tools, Tool.ReadOne);
                 else if (json.Named("ghost")) Ghost = json.Number();
+                else if (json.Named("phase")) Phase = json.Numbers(Phase);
                 else if (json.Named("speckle")) Speckle = (Speckle)json.Word(Words.Speckle);
                 else if (json.Named("registration")) Registration = json.Text(Registration);
                 else if (json.Named("probe")) Probe = Probe.Read(json, Probe);
@@ -795,7 +820,7 @@ namespace Ultragray
         }
         internal static readonly string[] Texts = { "scene", "scene_sha256", "renderer", "below_min_confidence", "contact", "speckle", "registration", "encoding" };
         internal static readonly string[] TextLists = { "outputs" };
-        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "sent_ms", "clock", "age_ms", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction", "preview" };
+        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "sent_ms", "clock", "age_ms", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "phase", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction", "preview" };
     }
 
     /// <summary>An error where a call as a whole does not fail.</summary>
@@ -996,6 +1021,59 @@ namespace Ultragray
         }
     }
 
+    /// <summary>One mode of motion, and the surrogate that tells its number.</summary>
+    public sealed class Mode : IReadable
+    {
+        /// <summary>Such as breathing.</summary>
+        public string Name { get; set; }
+        /// <summary>Least number that a frame was seen with.</summary>
+        public double Low { get; set; }
+        /// <summary>Greatest number that a frame was seen with.</summary>
+        public double High { get; set; }
+        /// <summary>Number at which the tissue is where the scene has it.</summary>
+        public double Rest { get; set; }
+        /// <summary>Of the number; empty: it has none.</summary>
+        public string Unit { get; set; }
+        /// <summary>What told the number: a belt, a column of a file.</summary>
+        public string Surrogate { get; set; }
+        public void Read(JsonReader json)
+        {
+            if (!json.Enter('{')) return;
+            while (json.NextMember())
+            {
+                if (json.Named("name")) Name = json.Text(Name);
+                else if (json.Named("low")) Low = json.Number();
+                else if (json.Named("high")) High = json.Number();
+                else if (json.Named("rest")) Rest = json.Number();
+                else if (json.Named("unit")) Unit = json.Text(Unit);
+                else if (json.Named("surrogate")) Surrogate = json.Text(Surrogate);
+                else json.Skip();
+            }
+        }
+    }
+
+    /// <summary>The modes of a scene, and the grid that their fields have in common, along the axes of the scene.</summary>
+    public sealed class Motion : IReadable
+    {
+        /// <summary>At least one.</summary>
+        public Mode[] Modes { get; set; }
+        /// <summary>The first spline.</summary>
+        public double[] OriginMm { get; set; }
+        /// <summary>Between splines.</summary>
+        public double[] SpacingMm { get; set; }
+        public void Read(JsonReader json)
+        {
+            if (!json.Enter('{')) return;
+            while (json.NextMember())
+            {
+                if (json.Named("modes")) Modes = json.Objects(Modes);
+                else if (json.Named("origin_mm")) OriginMm = json.Numbers(OriginMm);
+                else if (json.Named("spacing_mm")) SpacingMm = json.Numbers(SpacingMm);
+                else json.Skip();
+            }
+        }
+    }
+
     /// <summary>All that a scene says about itself; null where it is unknown.</summary>
     public sealed class SceneDetails : IReadable
     {
@@ -1029,6 +1107,8 @@ namespace Ultragray
         public ConfidenceFit Confidence { get; set; }
         /// <summary>Whether its frames can have natural speckle.</summary>
         public bool Speckle { get; set; }
+        /// <summary>Modes by which its tissue moves; null: it is still.</summary>
+        public Motion Motion { get; set; }
         /// <summary>Who imported or trained it; null: nobody.</summary>
         public string Owner { get; set; }
         /// <summary>Whether others may not see it.</summary>
@@ -1065,6 +1145,7 @@ namespace Ultragray
                 else if (json.Named("beam")) Beam = json.Object(Beam);
                 else if (json.Named("confidence")) Confidence = json.Object(Confidence);
                 else if (json.Named("speckle")) Speckle = json.Flag();
+                else if (json.Named("motion")) Motion = json.Object(Motion);
                 else if (json.Named("owner")) Owner = json.Text(Owner);
                 else if (json.Named("private")) Private = json.Flag();
                 else if (json.Named("parents")) Parents = json.Map(JsonReader.ReadText);

@@ -60,7 +60,11 @@ void check(const SpeckleModel& it, const Value& value) {
     check_count("strength", it.strength.size(), kLevels, value);
 }
 
+void check(const Breathing&, const Value&) {}
+
 void check(const RenderSettings& it, const Value& value) {
+    for (const auto& [name, given] : {std::pair("phase", it.phase && !it.phase->empty()), {"breathing", bool(it.breathing)}})
+        if (given) value.fail(name, "must not be given: frames without a service show tissue at rest");
     if (it.outputs.empty()) value.fail("outputs", "must name at least one");
 }
 

@@ -247,6 +247,17 @@ struct SpeckleModel {
 };
 void check(const SpeckleModel& it, const Value& value);
 
+struct Breathing {
+    static constexpr const char* title = "Breathing";
+    double period_s = 4.0;
+    double depth = 1.0;
+    void read(Fields& fields) {
+        fields.read("period_s", [&](const Value& value) { period_s = value.number({0.2, 60.0, {}}); });
+        fields.read("depth", [&](const Value& value) { depth = value.number({0.0, 2.0, {}}); });
+    }
+};
+void check(const Breathing& it, const Value& value);
+
 enum class Below { Refuse, Mask };
 inline Below read_Below(const Value& value) { return static_cast<Below>(value.word({"refuse", "mask"})); }
 
@@ -270,6 +281,8 @@ struct RenderSettings {
     std::optional<Contact> contact;
     std::optional<std::vector<Tool>> tools;
     std::optional<double> ghost;
+    std::optional<std::vector<double>> phase;
+    std::optional<Breathing> breathing;
     Speckle speckle = Speckle::Off;
     std::optional<Display> display;
     std::vector<std::string> outputs = {"bmode"};
@@ -285,6 +298,8 @@ struct RenderSettings {
         fields.read("contact", [&](const Value& value) { contact = read_Contact(value); });
         fields.read("tools", [&](const Value& value) { tools = read_list<Tool>(value, 8, [](const Value& value) { return read_Tool(value); }); });
         fields.read("ghost", [&](const Value& value) { ghost = value.number({0.0, 1.0, {}}); });
+        fields.read("phase", [&](const Value& value) { phase = value.numbers({}, 8); });
+        fields.read("breathing", [&](const Value& value) { breathing = read_object<Breathing>(value); });
         fields.read("speckle", [&](const Value& value) { speckle = read_Speckle(value); });
         fields.read("display", [&](const Value& value) { display = read_object<Display>(value); });
         fields.read("outputs", [&](const Value& value) { outputs = read_list<std::string>(value, {}, [](const Value& value) { return value.text(); }); });

@@ -19,10 +19,11 @@ from ultragray.geometry.probe import ElevationBeam, Probe
 from ultragray.rendering.display import Display
 from ultragray.rendering.settings import RenderSettings
 from ultragray.rendering.tools import Tool
+from ultragray.scene.modes import Breathing
 from ultragray.scene.speckle import SpeckleModel
 
 TARGET = Path(__file__).with_name("contract.hpp")
-CLASSES: tuple[Any, ...] = (ElevationBeam, Probe, Display, Tool, SpeckleModel, RenderSettings)
+CLASSES: tuple[Any, ...] = (ElevationBeam, Probe, Display, Tool, SpeckleModel, Breathing, RenderSettings)
 _HEAD = """// Written by generate.py from the contract's dataclasses: `make generate` writes it anew.
 // clang-format off
 #pragma once

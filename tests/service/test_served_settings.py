@@ -32,6 +32,7 @@ from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Contact, RenderSettings
 from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle
+from ultragray.scene.modes import Mode, Motion, Moving
 from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
@@ -85,6 +86,7 @@ CASES = {
     "tools": ({"tools": to_dict(TOOLS)}, {"tools": TOOLS}),
     "a needle and a ghost": ({"tools": to_dict((NEEDLE,)), "ghost": 0.5}, {"tools": (NEEDLE,), "ghost": 0.5}),
     "natural speckle": ({"speckle": "natural"}, {"speckle": "natural"}),
+    "a phase": ({"phase": [0.75]}, {"phase": (0.75,)}),
     "labels": ({"outputs": ["labels", "bmode"], "tools": to_dict(TOOLS)}, {"tools": TOOLS}),
     "display": ({"probe": to_dict(FAN), "display": to_dict(DISPLAY)}, {"probe": FAN, "display": DISPLAY}),
     **{one.kind: ({"probe": to_dict(one)}, {"probe": one}) for one in PROBES},
@@ -97,7 +99,11 @@ def scene():
     plain = make_scene(probe=DEMO_PROBE)
     labels = torch.tensor([0, 1, 200, 200], dtype=torch.uint8).repeat(100)
     info = SceneInfo(centre_mm=plain.info.centre_mm, probe=DEMO_PROBE, beam=BEAM, label_names=NAMES, speckle=SPECKLE)
-    return GaussianScene.from_splats(plain.splats, info=info, labels=labels, training_poses=plain.training_poses)
+    fields = np.zeros((1, 4, 4, 4, 3), np.float32)
+    fields[..., 2], fields[..., 1] = 8.0, np.linspace(-3.0, 3.0, 4)
+    moving = Moving(Motion((Mode("breathing", 0.0, 1.0),), (-40.0,) * 3, (30.0,) * 3), fields)
+    poses = plain.training_poses
+    return GaussianScene.from_splats(plain.splats, info=info, labels=labels, training_poses=poses, moving=moving)
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +132,7 @@ def expected(scene, name):  # [outputs, H, W]
     asked, options = CASES[name]
     options = {"probe": None, "beam": BEAM, **options}
     probe, display = options.pop("probe"), options.pop("display", None)
+    scene = scene.at_phase(options.pop("phase")) if "phase" in options else scene
     outputs = tuple(asked.get("outputs", ["bmode"]))
     frames = render(scene, probe, POSE, height=HEIGHT, width=WIDTH, outputs=outputs, **options)
     planes = {output: frames[output] for output in outputs}
@@ -148,6 +155,7 @@ def told(headers):
         "tools": json.loads(headers.get("X-Ultragray-Tools", "[]")),
         "ghost": float(headers.get("X-Ultragray-Ghost", 0.0)),
         "speckle": headers.get("X-Ultragray-Speckle", "off"),
+        **({"phase": json.loads(headers["X-Ultragray-Phase"])} if "X-Ultragray-Phase" in headers else {}),
         "dtype": headers["X-Ultragray-Dtype"],
         "outputs": headers["X-Ultragray-Outputs"].split(","),
     }
@@ -194,7 +202,7 @@ def test_the_other_doors_give_the_same(served, renders, scene, name):
     frame = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message()), timeout=300)
     np.testing.assert_allclose(np.frombuffer(frame.data, "<f4").reshape(truth.shape), truth, atol=1e-5)
     wanted = message_of(asked)
-    for field in ("probe", "contact", "tools", "ghost", "speckle", "display"):
+    for field in ("probe", "contact", "tools", "ghost", "phase", "speckle", "display"):
         if field in asked:
             assert getattr(frame, field) == getattr(wanted, field)
     with connect(served.stream_url("rich"), compression=None) as stream:
@@ -323,3 +331,22 @@ def test_a_scene_tells_what_it_has(http, served):
         stub = scenes_pb2_grpc.SceneServiceStub(channel)
         message = stub.GetScene(scenes_pb2.GetSceneRequest(scene="rich"), timeout=300)
     assert (dict(message.label_names), message.beam.thickness_mm) == (NAMES, 3.0)
+
+
+def test_a_frame_of_a_scene_that_breathes_is_rendered_again_from_the_phase_that_it_tells(http, scene):
+    asked = {"breathing": {"period_s": 3.0, "depth": 0.5}}
+    answer = http.post("scenes/rich/render", json=body(asked), headers=RAW)
+    assert answer.status_code == 200, answer.text
+    (number,) = json.loads(answer.headers["X-Ultragray-Phase"])
+    assert 0.0 <= number <= 0.5
+    again = http.post("scenes/rich/render", json=body({"phase": [number]}), headers=RAW)
+    assert again.content == answer.content
+    truth = render(scene.at_phase((number,)), None, POSE, height=HEIGHT, width=WIDTH, beam=BEAM).bmode[0]
+    np.testing.assert_allclose(np.frombuffer(answer.content, "<f4").reshape(truth.shape), truth, atol=1e-5)
+    mode = http.get("scenes/rich").json()["motion"]["modes"][0]
+    assert (mode["name"], mode["low"], mode["high"]) == ("breathing", 0.0, 1.0)
+
+
+def test_motion_of_a_still_scene_is_refused(http):
+    answer = http.post("scenes/poor/render", json=body({"phase": [0.5]}), headers=RAW)
+    assert (answer.status_code, answer.json()["field"]) == (422, "phase"), answer.text

@@ -199,7 +199,8 @@ class ShardRenderer:
         found: list[Extrapolation] = []
         for first in range(0, len(poses), at_once):
             look_up(0)
-            found.extend(self._assessor.assess(poses[first : first + at_once], probe=self._settings.probe))
+            some, settings = poses[first : first + at_once], self._settings
+            found.extend(self._assessor.assess(some, probe=settings.probe, phase=settings.phase))
         return found
 
 

@@ -236,6 +236,9 @@ def render_shown(
     where it masks them. `in_bytes`: B-mode alone may come rounded to uint8. Raises what `render` raises.
     """
     names = settings.outputs if outputs is None else tuple(outputs)
+    if settings.breathing is not None:
+        raise InvalidArgument("breathing is by the clock of a service: frames of files want a phase", field="breathing")
+    scene = scene.at_phase(settings.phase) if settings.phase else scene
     is_recorded = not scene.info.made_labels
     is_plain = is_recorded and _is_plain(settings) and not (support is not None and support.masks)
     if in_bytes and names == ("bmode",) and is_plain:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import pickle
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from enum import Enum
 from functools import cached_property, lru_cache
 from typing import Any
@@ -22,6 +22,7 @@ from ultragray.rendering.display import AS_RENDERED, Display
 from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS, check_available, check_outputs
 from ultragray.rendering.tools import MAX_TOOLS, Tool
 from ultragray.scene.info import SceneInfo
+from ultragray.scene.modes import MAX_MODES, Breathing, Motion
 
 
 class Encoding(str, Enum):
@@ -90,6 +91,17 @@ def check_speckle(speckle: Speckle, info: SceneInfo) -> None:
         )
 
 
+def check_motion(phase: tuple[float, ...] | None, breathing: Breathing | None, info: SceneInfo) -> None:
+    """Raises InvalidArgument for both, for either of a still scene, and for numbers that its modes do not have."""
+    if phase is not None and breathing is not None:
+        raise InvalidArgument("phase and breathing are given, where one chooses the other", field="breathing")
+    if info.motion is None and (phase or breathing is not None):
+        name = "phase" if phase else "breathing"
+        raise InvalidArgument(f"{name} needs a scene with modes of motion; this one is still", field=name)
+    if phase and info.motion is not None:
+        info.motion.checked(phase)
+
+
 def _least_confidence(settings: FrameSettings | Additions) -> float | None:
     """The confidence without which frames are refused, or left out by a sampler; None: any."""
     return settings.min_confidence if settings.below_min_confidence is Below.REFUSE else None
@@ -137,6 +149,12 @@ class FrameSettings(Contract):
         low=0.0,
         high=1.0,
     )
+    phase: tuple[float, ...] | None = described(
+        "Numbers of the scene's modes of motion, one each. Default: tissue is at rest.", None, most=MAX_MODES
+    )
+    breathing: Breathing | None = described(
+        "The first mode breathes by the service's clock; frames tell the phase that they were drawn with.", None
+    )
     speckle: Speckle = described(
         "natural: bmode has the speckle that scatterers in the tissue give a scanner's frames. Other outputs are as "
         "without.",
@@ -168,6 +186,7 @@ class FrameSettings(Contract):
                 field="min_confidence",
             )
         check_speckle(self.speckle, info)
+        check_motion(self.phase, self.breathing, info)
         given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return Resolved(
             probe=info.probe_or(self.probe),
@@ -177,6 +196,7 @@ class FrameSettings(Contract):
             outputs=self.outputs,
             encoding=encoding,
             display=self.display or AS_RENDERED,
+            breathing=self.breathing,
             **{name: value for name, value in given.items() if value is not None},
         )
 
@@ -219,6 +239,7 @@ class Additions:
     contact: Contact | None = described("As used; null: it was assumed.", None)
     tools: tuple[Tool, ...] = described("As used.", ())
     ghost: float = described("As used; 0: none.", 0.0)
+    phase: tuple[float, ...] = described("Numbers of the scene's modes of motion, as used; empty: at rest.", ())
     speckle: Speckle = described("As used.", Speckle.OFF)
     registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
     least_confidence = property(_least_confidence)
@@ -235,6 +256,13 @@ class Resolved(Additions):
     beam: ElevationBeam = PLANE
     encoding: Encoding = Encoding.UINT8
     display: Display = AS_RENDERED
+    breathing: Breathing | None = None  # that is to choose the phase of each frame
+
+    def breathed(self, motion: Motion | None) -> Resolved:
+        """With the phase of this moment, where tissue breathes by the clock: what is told of the frame."""
+        if self.breathing is None or motion is None:
+            return self
+        return replace(self, phase=self.breathing.phase(motion), breathing=None)
 
     @cached_property
     def picture(self) -> Picture:

@@ -416,10 +416,16 @@ class Assessor:
         self._model = read_model(info.confidence, len(training_poses)) if known else None
 
     def assess(
-        self, poses: Any, probe: Probe | None = None, *, coverage: npt.NDArray[Any] | None = None
+        self,
+        poses: Any,
+        probe: Probe | None = None,
+        *,
+        coverage: npt.NDArray[Any] | None = None,
+        phase: Sequence[float] = (),
     ) -> list[Extrapolation]:
         """One for each pose [C, 4, 4] or [4, 4] (mm, probe→scene) of a probe (None: the scene's own).
 
+        `phase`: of the scene's modes of motion; confidence falls outside the range that was seen.
         `coverage` [C, H, W] is the renderer's γ at these poses; a small image suffices. Raises InvalidPose, and
         InvalidProbe where no probe is known.
         """
@@ -433,7 +439,10 @@ class Assessor:
             unknown = [Extrapolation(None, None, None, None)] * len(checked)
             return unknown if coverage is None else self.with_support(unknown, shares)
         measures = self._views.measure(checked, self._info.probe_or(probe))
-        confidences = [None] * len(checked) if self._model is None else self._model.predict(measures).tolist()
+        trust = self._info.motion.trust(phase) if phase else 1.0
+        confidences = [None] * len(checked)
+        if self._model is not None:
+            confidences = (trust * self._model.predict(measures)).tolist()
         away = (measures.nearest_mm.mean(axis=1).tolist(), measures.angle_deg.mean(axis=1).tolist())
         found = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
         return found if coverage is None else self.with_support(found, shares)

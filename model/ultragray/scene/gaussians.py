@@ -6,7 +6,7 @@ mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -47,6 +47,7 @@ from ultragray.scene.info import (
     scene_file_invalid,
     with_summary,
 )
+from ultragray.scene.modes import MOTION_KEY, Moving
 from ultragray.scene.tissue import FollowingTissue
 
 PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
@@ -84,6 +85,7 @@ class GaussianScene:
     labels: Tensor | None = None  # [N] uint8
     pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
     rest_poses: FloatArray | None = None  # [P, 4, 4] mm: where the tissue at rest looks as training frames do
+    moving: Moving | None = None  # how its tissue moves; its motion is info.motion
     displacements: tuple[Displacement, ...] = ()  # of its tissue, see `under`; no part of the file
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
@@ -105,6 +107,7 @@ class GaussianScene:
         labels: Tensor | None = None,  # [N] uint8
         pose_corrections: Any = None,  # [P, 4, 4] mm
         rest_poses: Any = None,  # [P, 4, 4] mm
+        moving: Moving | None = None,
     ) -> GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
@@ -151,7 +154,8 @@ class GaussianScene:
             raise InvalidArgument("splats must hold at least one Gaussian", field="splats")
         poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
         check_training_pose_count(len(poses))
-        summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
+        described = replace(info or SceneInfo(), motion=None if moving is None else moving.motion)
+        summary = with_summary(described, means.detach().cpu().double().numpy(), degree)
         names = _names_of_labels(labels, means, summary.label_names)
         beside: dict[str, Any] = {
             name: None if motions is None else check_beside(name, motions, len(poses))
@@ -164,6 +168,7 @@ class GaussianScene:
             training_poses=poses,
             labels=labels,
             **beside,
+            moving=moving,
         )
 
     @property
@@ -250,6 +255,19 @@ class GaussianScene:
         moved._prepared = self._prepared
         return moved
 
+    def at_phase(self, phase: Sequence[float]) -> GaussianScene:  # [M]
+        """The scene with its tissue where its modes of motion have it at these numbers. Raises InvalidArgument."""
+        if self.moving is None:
+            raise InvalidArgument("phase needs a scene with modes of motion; this one is still", field="phase")
+        motion = self.moving.motion
+        numbers = np.asarray(motion.checked(phase)) - motion.rest
+        if not numbers.any():
+            return self.under()
+        coefficients = np.einsum("m,mxyzi->xyzi", numbers, self.moving.coefficients).astype(np.float32)
+        return self.under(
+            Displacement.on_grid(torch.from_numpy(coefficients)[None], motion.origin_mm, motion.spacing_mm)
+        )
+
     def check_displacements(self, pose_count: int) -> None:
         """Raises InvalidArgument where a displacement is neither for all poses of a call nor has one for each."""
         for one in self.displacements:
@@ -299,7 +317,8 @@ class GaussianScene:
         for name in BESIDE:
             if (motions := getattr(self, name)) is not None:
                 tensors[name] = torch.from_numpy(np.ascontiguousarray(motions))
-        data: bytes = save(tensors, metadata={METADATA_KEY: description})
+        motion = {} if self.moving is None else {MOTION_KEY: self.moving.to_json()}
+        data: bytes = save(tensors, metadata={METADATA_KEY: description, **motion})
         check_header_size(data)
         return data
 
@@ -324,6 +343,7 @@ class GaussianScene:
                 labels=labels,
                 pose_corrections=header.pose_corrections,
                 rest_poses=header.rest_poses,
+                moving=header.moving,
             )
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error

@@ -3,9 +3,10 @@
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
 [N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm; where these were corrected,
 pose_corrections likewise; where tissue followed the probe, rest_poses likewise; and, where the Gaussians carry labels,
-labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo. In a compressed
-one (.ugz) the tensors `compressed`, part.00, part.01 … (see `compressed`) stand in the place of those of the Gaussians.
-All but the Gaussians is bounded, so that the description of any file is read in little memory and time.
+labels [N] uint8. Its metadata holds an entry `ultragray`, a JSON object with the fields of SceneInfo, and, where its
+tissue moves, one of its modes (see `modes`). In a compressed one (.ugz) the tensors `compressed`, part.00, part.01 …
+(see `compressed`) stand in the place of those of the Gaussians. All but the Gaussians is bounded, so that the
+description of any file is read in little memory and time.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from ultragray.geometry.pose import MAX_POSITION_MM, check_poses
 from ultragray.geometry.probe import PLANE, ElevationBeam, FloatArray, Probe
 from ultragray.scene.compressed import COMPRESSED_TENSOR, MAX_PARTS, check_tensor, part_name, unpack
 from ultragray.scene.confidence import read_model
+from ultragray.scene.modes import MOTION_KEY, Motion, Moving
 from ultragray.scene.speckle import SpeckleModel
 
 FORMAT_VERSION = 1
@@ -78,6 +80,7 @@ class SceneInfo(Contract):
         high=1.0,
     )
 
+    motion: Motion | None = described("Modes by which its tissue moves; none: it is still.", None)
     provenance: dict[str, Any] = described(
         "What an edit made it of: `parents`, SHA-256 by name; `edits`; `made`, labels of what was never recorded. "
         "Empty: it was trained.",
@@ -140,6 +143,7 @@ def _label_names(names: Any) -> dict[int, str]:
 
 def info_to_json(info: SceneInfo) -> str:
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
+    del document["motion"]  # an entry of its own in the file
     for name in ("label_names", "beam", "speckle", "tissue_shares", "provenance"):
         if not document[name]:
             del document[name]  # a scene without them keeps its bytes, and its hash
@@ -156,7 +160,7 @@ def info_from_json(text: str) -> SceneInfo:
     if not isinstance(document, dict):
         raise ValueError("its metadata is not a JSON object")
     require_version(document.pop("format_version", None), FORMAT_VERSION)
-    unknown = set(document) - set(SceneInfo.__dataclass_fields__)
+    unknown = set(document) - set(SceneInfo.__dataclass_fields__) | {"motion"} & set(document)
     if unknown:
         raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
     if document.get("probe") is not None:
@@ -191,6 +195,7 @@ class SceneHeader:
     pose_corrections: FloatArray | None = field(default=None, repr=False)
     # [P, 4, 4] mm: where the tissue at rest looks as the training frames do; None: at the training poses
     rest_poses: FloatArray | None = field(default=None, repr=False)
+    moving: Moving | None = field(default=None, repr=False)
     is_compressed: bool = field(default=False, repr=False)
     text_bytes: int = field(default=0, repr=False)  # of the bundle's header: the description, and where each tensor is
 
@@ -209,7 +214,8 @@ def read_header(path: str | Path) -> SceneHeader:
             metadata = bundle.metadata() or {}
             if METADATA_KEY not in metadata:
                 raise ValueError("it is a safetensors file, but not one of ultragray's")
-            info = info_from_json(metadata[METADATA_KEY])
+            moving = Moving.from_json(metadata[MOTION_KEY]) if MOTION_KEY in metadata else None
+            info = replace(info_from_json(metadata[METADATA_KEY]), motion=None if moving is None else moving.motion)
             is_compressed = COMPRESSED_TENSOR in bundle.keys()  # noqa: SIM118
             (_check_parts if is_compressed else _check_gaussians)(bundle, info)
             _check_poses(bundle)
@@ -225,7 +231,7 @@ def read_header(path: str | Path) -> SceneHeader:
                 check_tensor(found, metadata[METADATA_KEY], poses, *beside.values())
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
-    return SceneHeader(info, poses, size, **beside, is_compressed=is_compressed, text_bytes=text_bytes)
+    return SceneHeader(info, poses, size, **beside, moving=moving, is_compressed=is_compressed, text_bytes=text_bytes)
 
 
 def read_gaussians(path: str | Path, info: SceneInfo) -> dict[str, npt.NDArray[Any]]:

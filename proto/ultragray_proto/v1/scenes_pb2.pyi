@@ -65,7 +65,7 @@ class GetSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam", "speckle", "parents", "edits", "made_labels")
+    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam", "speckle", "parents", "edits", "made_labels", "motion")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -113,6 +113,7 @@ class Scene(_message.Message):
     PARENTS_FIELD_NUMBER: _ClassVar[int]
     EDITS_FIELD_NUMBER: _ClassVar[int]
     MADE_LABELS_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
     bounds_min_mm: _geometry_pb2.Position
     bounds_max_mm: _geometry_pb2.Position
     name: str
@@ -139,7 +140,42 @@ class Scene(_message.Message):
     parents: _containers.ScalarMap[str, str]
     edits: _containers.RepeatedScalarFieldContainer[str]
     made_labels: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ..., speckle: _Optional[bool] = ..., parents: _Optional[_Mapping[str, str]] = ..., edits: _Optional[_Iterable[str]] = ..., made_labels: _Optional[_Iterable[str]] = ...) -> None: ...
+    motion: Motion
+    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ..., speckle: _Optional[bool] = ..., parents: _Optional[_Mapping[str, str]] = ..., edits: _Optional[_Iterable[str]] = ..., made_labels: _Optional[_Iterable[str]] = ..., motion: _Optional[_Union[Motion, _Mapping]] = ...) -> None: ...
+
+class Motion(_message.Message):
+    __slots__ = ("modes", "origin_mm", "spacing_mm")
+    MODES_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_MM_FIELD_NUMBER: _ClassVar[int]
+    SPACING_MM_FIELD_NUMBER: _ClassVar[int]
+    modes: _containers.RepeatedCompositeFieldContainer[Mode]
+    origin_mm: _containers.RepeatedScalarFieldContainer[float]
+    spacing_mm: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, modes: _Optional[_Iterable[_Union[Mode, _Mapping]]] = ..., origin_mm: _Optional[_Iterable[float]] = ..., spacing_mm: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Mode(_message.Message):
+    __slots__ = ("name", "low", "high", "rest", "unit", "surrogate")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    REST_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    SURROGATE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    low: float
+    high: float
+    rest: float
+    unit: str
+    surrogate: str
+    def __init__(self, name: _Optional[str] = ..., low: _Optional[float] = ..., high: _Optional[float] = ..., rest: _Optional[float] = ..., unit: _Optional[str] = ..., surrogate: _Optional[str] = ...) -> None: ...
+
+class Breathing(_message.Message):
+    __slots__ = ("period_s", "depth")
+    PERIOD_S_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
+    period_s: float
+    depth: float
+    def __init__(self, period_s: _Optional[float] = ..., depth: _Optional[float] = ...) -> None: ...
 
 class ConfidenceFit(_message.Message):
     __slots__ = ("error", "fitted_on")

@@ -163,7 +163,7 @@ def render_frames(
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
     if sampler is None and given_poses is None:
         sampler = TrainingSampler()
-    assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
+    assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe, phase=settings.phase)
     poses, extrapolations = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
     picture = (settings if format is None else FORMATS[format].shown(settings)).picture
     stored = "uint8" if format is None else check_format(format, settings.outputs, dtype)

@@ -220,9 +220,10 @@ class Rendering:
             raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
         turn = turn or Turn()
         for _ in range(MAX_SCENE_CHANGES):
+            wanted = settings or plan.settings
             request = RenderRequest(
                 plan.scene,
-                settings or plan.settings,
+                wanted.breathed(plan.header.info.motion) if isinstance(wanted, Resolved) else wanted,
                 poses,
                 priority,
                 deadline,

@@ -23,6 +23,7 @@ from ultragray.geometry.probe import ElevationBeam, Probe
 from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS
 from ultragray.scene.confidence import read_model
 from ultragray.scene.info import SceneHeader
+from ultragray.scene.modes import Motion
 from ultragray_service.access.owners import Owners
 from ultragray_service.access.principals import iso_time
 from ultragray_service.core.life import Life
@@ -297,6 +298,7 @@ class Scene:
     beam: ElevationBeam | None = described("Of the frames it was trained on; null: they are taken for planes.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")
     speckle: bool = described("Whether its frames can have natural speckle.")
+    motion: Motion | None = described("Modes by which its tissue moves; null: it is still.")
     owner: str | None = described("Who imported or trained it; null: nobody.")
     private: bool = described("Whether others may not see it.")
     parents: dict[str, str] = described("SHA-256 by name of the scenes that edits made it of; empty: it was trained.")
@@ -336,6 +338,7 @@ class Scene:
             beam=info.beam,
             confidence=None if model is None else ConfidenceFit(model.error, model.fitted_on),
             speckle=info.speckle is not None,
+            motion=info.motion,
             owner=ownership.owner,
             private=ownership.private,
             parents=info.provenance.get("parents", {}),

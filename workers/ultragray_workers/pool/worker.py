@@ -206,7 +206,7 @@ class _Worker:
                 wanted.setdefault(name, set()).add(part.settings.encoding.pixel_type)
         try:
             loaded = self._scene_of(task)
-            extrapolations = loaded.assessor.assess(poses, task.view.probe)
+            extrapolations = loaded.assessor.assess(poses, task.view.probe, phase=task.view.phase)
         except SceneChangedError as error:
             yield from [error] * len(task.parts)
             return

@@ -141,6 +141,8 @@ class RenderJob(FrameSettings, Specification):
         scene = surroundings.scene
         assert scene is not None
         settings = self.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
+        if self.breathing is not None:
+            raise InvalidArgument("breathing is by the clock: frames of a job want a phase", field="breathing")
         if self.contact is not None:
             way_in(scene.training_poses, scene.info.probe)
         if self.is_sharded:
@@ -151,7 +153,7 @@ class RenderJob(FrameSettings, Specification):
             poses = self.poses_of(scene.training_poses, settings.probe)
             if len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE:
                 assessor = Assessor(scene.info, scene.training_poses)
-                require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
+                require_confidence(assessor.assess(poses, settings.probe, phase=settings.phase), self.least_confidence)
         with under("display"):
             picture = self.file_format.shown(settings).picture
         if surroundings.free_bytes is not None:

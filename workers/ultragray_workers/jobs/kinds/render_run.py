@@ -10,7 +10,7 @@ from statistics import fmean
 
 from ultragray.exchange.rendering import assess_by_rendering, render_portions, render_to_file
 from ultragray.files import file_sha256, write_whole
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import spread_places
 from ultragray.learn.training.memory import training_device
 from ultragray.rendering.limits import Limits
@@ -45,7 +45,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     settings = job.resolved(described.info, Encoding.FLOAT32)
     limits = Limits(job_run.request.max_footprint_pixels)
     scene = GaussianScene.load(path).to(device)
-    assess = _assessing(job_run, described, settings.probe)
+    assess = _assessing(job_run, described, settings)
     if job.sampler is not None:
         assess = assess_by_rendering(scene, settings, assess, limits=limits)
     poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
@@ -95,7 +95,7 @@ def _write_examples(
         write_whole(folder / f"example_{place:05d}.png", png_file(to_uint8(OUTPUTS[name].shares(picture))))
 
 
-def _assessing(job_run: JobRun, described: SceneHeader, probe: Probe) -> Assess:
+def _assessing(job_run: JobRun, described: SceneHeader, settings: Resolved) -> Assess:
     """A function that tells how far poses extrapolate, until the job is to stop."""
     assessor = Assessor(described.info, described.training_poses)
     at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
@@ -105,7 +105,7 @@ def _assessing(job_run: JobRun, described: SceneHeader, probe: Probe) -> Assess:
         for first in range(0, len(poses), at_once):
             if job_run.should_stop():
                 raise Stopped
-            found.extend(assessor.assess(poses[first : first + at_once], probe=probe))
+            found.extend(assessor.assess(poses[first : first + at_once], settings.probe, phase=settings.phase))
         return found
 
     return assess
