@@ -317,4 +317,4 @@ class Shadows:
 
 
 def _usual_by_depth(images: FloatImage) -> FloatImage:  # [F, H, W] -> [H]
-    return np.array([np.quantile(images[:, row], USUAL) for row in range(images.shape[1])], np.float32)
+    return np.quantile(images, USUAL, axis=(0, 2)).astype(np.float32)

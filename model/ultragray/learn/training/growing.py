@@ -33,17 +33,17 @@ from ultragray.learn.sweep import (
     corner_distances_mm,
     spread_places,
 )
+from ultragray.learn.training.batch import Batch
 from ultragray.learn.training.between import ViewsBetween, neighbours_of
 from ultragray.learn.training.checkpointing import CheckpointHeader, read_checkpoint, write_checkpoint
 from ultragray.learn.training.confidence import Examples, fit_weights
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.learn.training.geometry import Geometry, Shadows, out_of_plane_shift_mm, shift_out_of_plane
+from ultragray.learn.training.geometry import Geometry, Shadows
 from ultragray.learn.training.initial import Start, initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0
-from ultragray.learn.training.losses import SSIM_WINDOW, absorption_loss, image_loss
+from ultragray.learn.training.losses import SSIM_WINDOW
 from ultragray.learn.training.memory import training_device
 from ultragray.learn.training.optimizer import Optimizer, Schedule, is_trained
-from ultragray.rendering.backends import cuda
 from ultragray.rendering.backends.inputs import spatial_order
 from ultragray.rendering.backends.registry import choose_backend
 from ultragray.rendering.frames import render
@@ -58,6 +58,8 @@ SURVEY_GROWTH = 1.5
 WINDOW_FRAMES = 6  # about each new one, among which it finds its neighbours
 STILL = 0.25  # of the usual spacing: a frame nearer to one that is there already shows no new place
 RECENT_FRAMES = 16
+COARSE_STEPS = (60, 20)  # of Gaussians' first: on frames of half the size; of a quarter, which take a third of the time
+COARSE_GAUSSIANS = 0.5  # of the pixels of a frame: with more of them, it is they that take the time
 FLOOR_STEPS = 75  # of a Gaussian's first, in which what lies in a shadow keeps its floor
 JUDGES = 8  # held-out frames of a version, beside those that are new since the one before
 LEAST_CAUTION, REGAINED = 0.05, 1.1  # of the factor on all rates: its least, and what a version gives back of it
@@ -120,25 +122,24 @@ class GrowingTrainer:
         first = max(0, len(train) - RECENT_FRAMES) if is_recent else 0
         own_count = min(config.batch_size - config.batch_size // 2, len(train) - first)
         own = first + torch.randperm(len(train) - first, generator=self._generator)[:own_count]
-        between = self._between[is_recent].draw(config.batch_size // 2, self._generator)
-        poses = np.concatenate([train.poses[own.numpy()], between.poses])
-        if config.out_of_plane_mm:
-            poses = shift_out_of_plane(poses, out_of_plane_shift_mm(config.out_of_plane_mm, self._generator))
-        truth = self._images[cuda.upload(own, self._device)].float().div_(255.0)
-        assert config.texture is not None
+        between = self._between[is_recent]
+        batch = Batch.of(train, self._images, own, between, config.batch_size // 2, config, self._generator)
+        shadowed, age = self._shadowed, self.step - int(self._born.max() if is_recent else self._born.median())
+        is_quick = self.gaussian_count <= COARSE_GAUSSIANS * train.height * train.width
+        for steps in COARSE_STEPS:
+            if age < steps and is_quick and batch.can_be_halved:
+                batch, shadowed = batch.halved(shadowed)
+        height, width = batch.truth.shape[1:]
         frames = render(
             self._view(),
             self._probe,
-            poses,
-            height=train.height,
-            width=train.width,
+            batch.poses,
+            height=height,
+            width=width,
             outputs=("bmode", "transmittance"),
             backend=self._chosen_backend,
         )
-        image = image_loss(frames["bmode"], torch.cat([truth, between.images]), config.texture, between.weights)
-        sides = torch.cat([own[:, None].expand(-1, 2), torch.from_numpy(between.places.frames)])
-        sides = cuda.upload(sides, self._device)
-        loss = image + absorption_loss(frames["transmittance"], self._shadowed, sides, config.absorption_penalty)
+        loss = batch.loss(frames, shadowed, config)
         loss.backward()  # type: ignore[no-untyped-call]
         with torch.no_grad():
             rates = self._schedule.rates(0)

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +19,7 @@ from ultragray.errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, T
 from ultragray.files import remove_stale_temporaries, write_whole
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, spread_places
+from ultragray.learn.training.batch import Batch
 from ultragray.learn.training.beam import TrainedBeam
 from ultragray.learn.training.between import ViewsBetween, neighbours_of
 from ultragray.learn.training.checkpointing import (
@@ -30,10 +30,10 @@ from ultragray.learn.training.checkpointing import (
     write_checkpoint,
 )
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows, out_of_plane_shift_mm, shift_out_of_plane
+from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows
 from ultragray.learn.training.initial import initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0
-from ultragray.learn.training.losses import SSIM_WINDOW, absorption_loss, image_loss
+from ultragray.learn.training.losses import SSIM_WINDOW
 from ultragray.learn.training.memory import (
     check_comparison_memory,
     check_memory,
@@ -45,7 +45,6 @@ from ultragray.learn.training.optimizer import Optimizer, PullStatistics, Schedu
 from ultragray.learn.training.pictures import write_picture
 from ultragray.learn.training.poses import PoseRefinement
 from ultragray.learn.training.progress import Board, Journal, Progress, StepTimer
-from ultragray.rendering.backends import cuda
 from ultragray.rendering.backends.registry import choose_backend
 from ultragray.rendering.frames import Frames, render
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
@@ -99,8 +98,6 @@ class Trainer:
         if not config.views_between:
             neighbours = neighbours.without_ends()  # nothing would train what begins there
         assert config.views_between is not None
-        assert config.texture is not None
-        self._texture = config.texture
         self._between_count = round(config.views_between * config.batch_size)
         self._views_between = ViewsBetween(dataset.train, neighbours, self._images) if self._between_count else None
         self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
@@ -221,23 +218,11 @@ class Trainer:
 
     def take_step(self) -> float:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
-        batch = self._sampler.next_batch()
-        poses, neighbours = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
-        truth, weights = self._images[cuda.upload(batch, self._device)].float().div_(255.0), None
-        if self._views_between is not None:
-            between = self._views_between.draw(self._between_count, self._generator)
-            batch = torch.cat([batch, torch.from_numpy(between.places.nearer)])
-            neighbours = torch.cat([neighbours, torch.from_numpy(between.places.frames)])
-            poses = np.concatenate([poses, between.poses])
-            truth, weights = torch.cat([truth, between.images]), between.weights
-        if self.config.out_of_plane_mm:
-            poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
-        frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
-        image = image_loss(frames["bmode"], truth, self._texture, weights)
-        if self._shadowed is not None:
-            neighbours = cuda.upload(neighbours, self._device)
-            price = self.config.absorption_penalty
-            image = image + absorption_loss(frames["transmittance"], self._shadowed, neighbours, price)
+        own, config = self._sampler.next_batch(), self.config
+        between = self._views_between
+        batch = Batch.of(self.dataset.train, self._images, own, between, self._between_count, config, self._generator)
+        poses = self.refinement.corrected(batch.nearest, batch.poses)
+        image = batch.loss(self._rendered(poses, self._schedule.sh_degree(self.step)), self._shadowed, config)
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():

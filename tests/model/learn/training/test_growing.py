@@ -69,6 +69,23 @@ def test_gaussians_begin_with_each_frame_before_any_step_on_it(sweep):
     assert min(judgement.psnr_db.values()) > 12.0  # black frames have less
 
 
+def test_the_first_steps_of_gaussians_are_on_small_frames(sweep, monkeypatch):
+    heights, true_render = [], growing.render
+    monkeypatch.setattr(growing, "render", lambda *a, **k: heights.append(k["height"]) or true_render(*a, **k))
+    trainer = grown(sweep, steps=0)
+    monkeypatch.setattr(growing, "COARSE_GAUSSIANS", 100.0)
+    half, quarter = growing.COARSE_STEPS
+    for _ in range(half + 1):
+        trainer.take_step()
+    assert heights == [SIDE // 4] * quarter + [SIDE // 2] * (half - quarter) + [SIDE]
+
+
+def test_frames_of_an_odd_size_are_learned_as_they_are(sweep):
+    trainer = GrowingTrainer("phantom", PHANTOM_PROBE)
+    trainer.add(sweep.images[:, : SIDE - 1], sweep.poses)
+    assert np.isfinite(trainer.take_step())
+
+
 def test_a_probe_that_stands_still_adds_no_gaussians(sweep):
     trainer = grown(sweep)
     before = trainer.gaussian_count

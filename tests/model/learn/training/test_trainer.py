@@ -25,7 +25,7 @@ from ultragray.errors import (
     TrainingDiverged,
     TrainingStateInvalid,
 )
-from ultragray.learn.training import train, trainer
+from ultragray.learn.training import batch, train, trainer
 from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.run import scene_of_checkpoint
 from ultragray.scene import info as scene_info
@@ -178,14 +178,14 @@ def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, s
 
 
 def test_divergence_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
-    true_loss, calls = trainer.image_loss, 0
+    true_loss, calls = batch.image_loss, 0
 
     def loss_that_breaks(rendered, truth, *settings):
         nonlocal calls
         calls += 1
         return true_loss(rendered, truth, *settings) * (float("nan") if calls == 6 else 1.0)
 
-    monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
+    monkeypatch.setattr(batch, "image_loss", loss_that_breaks)
     with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):
         train(tiny_dataset(), tiny_config(), folder=tmp_path, checkpoint_interval_s=0.0)
     scene = scene_of_checkpoint(tiny_dataset(), tmp_path)
