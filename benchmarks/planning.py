@@ -32,7 +32,7 @@ PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=32.0)
 SIDE = 64  # pixels
 HALF_MM, FIRST_MM, LENGTH_MM, TILT_DEG = 12.0, -16.0, 32.0, 12.0  # of the field, for the middle of the face
 FRAMES = 36  # of a raster
-ROUNDS = (6, 6, 6)  # frames: the first are even, the others planned by the scene of those before
+ROUNDS = (6, 12)  # frames: the first are even, the others planned by the scene of those before
 WITHIN_MM = 2.0  # of coverage: about half the spacing of an even raster of half the frames
 TRAINING = TrainingConfig(steps=100, max_gaussians=2500, refine_poses="none", confidence=False)
 UNSEEN = 12

@@ -412,10 +412,10 @@ class PlanSettings:
     """
 
     probe: Probe | None = None  # That is to scan. Default: the scene's own.
-    # What to gain. coverage: share of the points within within_mm of an image. confidence: expected MS-SSIM of
+    # What to gain. coverage: how near images come to the points, by within_mm. confidence: expected MS-SSIM of
     # frames that show them. uncertainty: of the variance of errors that views can take away, the share they do.
     want: str = "coverage"
-    within_mm: float = 1.5  # Of coverage: how near to a point an image covers it.
+    within_mm: float = 1.5  # Of coverage: a point so far from the nearest image counts half.
     # Only points of this box count, such as -20:20,0:30,-5:45. Default: all that poses in reach show.
     region_mm: str | None = None
     label: int | None = None  # Only points with this label count.

@@ -8,7 +8,7 @@ The gain. Points v of what is wanted are looked at, each from a direction of the
 
 T is the transmittance of the scene between the face and v (its own attenuation, integrated along the scan line: what
 lies in shadow is not seen), d the distance of v to the image, α the angle between the view and the direction, and φ
-falls with both: 1 where d ≤ within_mm and else 0 for coverage; the logistic curve that the scene's confidence was
+falls with both: ½^(d / within_mm) for coverage; the logistic curve that the scene's confidence was
 fitted to; or the terms of its uncertainty that shrink near views. The best view of a point counts:
 
     F(S) = mean over v of max over p in S ∪ (views that the scene has) of w(v, p)
@@ -17,8 +17,9 @@ F is monotone, and submodular: the more views there are, the less another one ad
 location). So taking the view with the largest gain, again and again, comes to at least 1 − 1/e of what the best choice
 of as many views gains (Nemhauser, Wolsey and Fisher 1978), and gains that were computed before are upper bounds now: a
 view whose bound is below a gain that is known need not be looked at (Minoux 1978). T ≤ 1 makes the gain without shadow
-such a bound, so that shadows are computed for few of the views. With a limit on the way, views are taken by gain per mm
-of detour; for that choice there is no such guarantee.
+such a bound, so that shadows are computed for few of the views. What was best first need not be so beside the others:
+so each view is then exchanged for one that gains more in its place, until there is none. With a limit on the way, views
+are taken by gain per mm of detour; for that choice there is no guarantee, and no exchange.
 """
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ def curve_of(asked: PlanSettings, model: ConfidenceModel | None, hardness: Value
     """
     match asked.want:
         case "coverage":
-            return lambda distance, _: distance <= asked.within_mm
+            return lambda distance, _: np.exp2(-distance / asked.within_mm)
         case "confidence" if model is not None:
             return partial(_expected, model.weights, hardness)
         case "uncertainty" if model is not None and model.uncertainty is not None:
@@ -234,7 +235,7 @@ def choose(
 ) -> tuple[list[int], list[float]]:
     """The views with the largest gains in turn, and these gains, until none gains anything."""
     costs = np.ones(len(worth)) if costs is None else costs
-    bounds = np.maximum(worth - best, 0.0).mean(axis=1, dtype=np.float64)
+    bounds = (np.maximum(worth, best).mean(axis=1) - best.mean()).astype(np.float64)
     is_shaded = np.zeros(len(worth), bool)
     chosen: list[int] = []
     gains: list[float] = []
@@ -254,6 +255,29 @@ def choose(
         bounds[view] = 0.0
         after_each(view)
     return chosen, gains
+
+
+_ROUNDS = 4  # of exchanges, at most
+_LEAST_MORE = 1e-3  # that another view must gain in the place of one, as a share of its gain
+
+
+def exchange(worth: Values, before: Values, chosen: Sequence[int], *, shade: Callable[[int], None]) -> list[int]:
+    """The chosen views, each exchanged for the one that gains most in its place, in turn, until none would gain more.
+
+    `worth` [C, V] is as `choose` has it, `before` [V] what points had without any of them.
+    """
+    views = list(chosen)
+    for _ in range(_ROUNDS):
+        is_changed = False
+        for place, view in enumerate(views):
+            others = np.maximum.reduce([before, *worth[views[:place] + views[place + 1 :]]])
+            gain = np.maximum(worth[view] - others, 0.0).mean(dtype=np.float64)
+            found, gains = choose(worth, others, 1, shade=shade)
+            if found and gains[0] > (1.0 + _LEAST_MORE) * gain:
+                views[place], is_changed = found[0], True
+        if not is_changed:
+            break
+    return views
 
 
 # The way: the shortest path through views whose order is free. Steps are taken as symmetric, and the path may end
@@ -362,14 +386,26 @@ def plan_views(
         limits.check_flag()
         np.minimum(costs, corner_distances_mm(corners, corners[view]) + _LEAST_DETOUR_MM, out=costs)
 
+    is_shaded = np.zeros(len(candidates), bool)
+
+    def shade_once(view: int) -> None:
+        limits.check_flag()
+        if not is_shaded[view]:
+            shade(worths[view], best, targets.points, candidates[view], probe, attenuation)
+        is_shaded[view] = True
+
     chosen, gains = choose(
         worths,
-        best,
+        best.copy(),
         asked.views,
-        shade=lambda view: shade(worths[view], best, targets.points, candidates[view], probe, attenuation),
+        shade=shade_once,
         costs=None if asked.path_mm is None else costs,
         after_each=after_each,
     )
+    if asked.path_mm is None:
+        chosen = exchange(worths, best, chosen, shade=shade_once)
+        ranks, gains = choose(worths[chosen], best, len(chosen))
+        chosen = [chosen[rank] for rank in ranks]
 
     def way(count: int) -> tuple[IntArray, float]:
         some = corners[chosen[:count]]

@@ -30,12 +30,14 @@ class PlanSettings(Contract):
 
     probe: Probe | None = described("That is to scan. Default: the scene's own.", None, error=InvalidProbe)
     want: str = described(
-        "What to gain. coverage: share of the points within within_mm of an image. confidence: expected MS-SSIM of "
+        "What to gain. coverage: how near images come to the points, by within_mm. confidence: expected MS-SSIM of "
         "frames that show them. uncertainty: of the variance of errors that views can take away, the share they do.",
         "coverage",
         choices=WANTS,
     )
-    within_mm: float = described("Of coverage: how near to a point an image covers it.", 1.5, above=0.0, high=50.0)
+    within_mm: float = described(
+        "Of coverage: a point so far from the nearest image counts half.", 1.5, above=0.0, high=50.0
+    )
     region_mm: str | None = described(
         "Only points of this box count, such as -20:20,0:30,-5:45. Default: all that poses in reach show.", None
     )

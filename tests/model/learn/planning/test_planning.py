@@ -13,7 +13,7 @@ from ultragray import LinearProbe, PlanSettings, plan_views
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.learn.planning.reach import LEAST_CONTACT, poses_in_reach
-from ultragray.learn.planning.search import choose, distances_mm, shortest_path
+from ultragray.learn.planning.search import choose, distances_mm, exchange, shortest_path
 from ultragray.learn.sweep import corner_distances_mm
 from ultragray.phantom.demo import load_demo_scene
 from ultragray.rendering.contact import Skin, Touch
@@ -64,6 +64,29 @@ def test_a_greedy_choice_is_near_the_best_one() -> None:
     _, gains = choose(worth.copy(), nothing.copy(), 3)
     best = max(np.maximum.reduce(worth[list(views)]).mean() for views in permutations(range(9), 3))
     assert (1.0 - 1.0 / np.e) * best <= sum(gains) <= best + 1e-6
+
+
+def test_views_that_were_best_alone_are_exchanged_for_those_that_are_best_together() -> None:
+    """On a line from 0 to 8 one view is best in the middle, two at the quarters."""
+    line = np.linspace(0.0, 8.0, 81)
+    worth = np.exp2(-np.square((np.arange(9.0)[:, None] - line) / 2.0)).astype(np.float32)
+    nothing = np.zeros(81, np.float32)
+    chosen, gains = choose(worth.copy(), nothing.copy(), 2)
+    assert chosen[0] == 4
+    better = exchange(worth.copy(), nothing, chosen, shade=lambda view: None)
+    assert sorted(better) == [2, 6]
+    assert np.maximum.reduce(worth[better]).mean() > sum(gains)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exchanges_never_lose_anything_nor_what_points_had_before(seed: int) -> None:
+    worth, before = drawn(seed, views=40)
+    kept = before.copy()
+    chosen, gains = choose(worth.copy(), before.copy(), 5)
+    better = exchange(worth.copy(), before, chosen, shade=lambda view: None)
+    np.testing.assert_array_equal(before, kept)
+    assert len(set(better)) == 5
+    assert np.maximum.reduce([before, *worth[better]]).mean() - before.mean() >= sum(gains) - 1e-6
 
 
 def test_views_that_gain_nothing_are_left_out() -> None:
