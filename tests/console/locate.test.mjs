@@ -60,6 +60,19 @@ describe("the search for a frame", () => {
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
 
+  it("finds it from anywhere, without a start", async () => {
+    const page = await openSearch();
+    const taken = await poseOf(page);
+    await choose(page, "real.png", await render({ pose: taken }));
+    await enterPose(page, JSON.stringify(moved(taken, 12, 25)));
+    await page.getByRole("checkbox", { name: "Anywhere along the sweep" }).check();
+    assert.equal(await page.getByLabel("How far the probe may be off, mm", { exact: true }).count(), 0);
+    await page.getByRole("button", { name: "Search", exact: true }).click();
+    await panelOf(page).getByText("Found.").waitFor({ timeout: SEARCH_TIMEOUT_MS });
+    await panelOf(page).getByRole("button", { name: "Go there" }).click();
+    await until(() => poseOf(page), ({ position_mm: { x } }) => Math.abs(x - taken.position_mm.x) < 0.3, "it is elsewhere");
+  });
+
   it("says that it was not found, and offers no pose then", async () => {
     const page = await openSearch();
     const pose = await poseOf(page);

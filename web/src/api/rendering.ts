@@ -76,7 +76,7 @@ export const WITHIN: { name: keyof Within; field: Described }[] = (["within_mm",
 /** Looks for a frame, the base64 of a PNG file, about `start`. `probe`: null for the scene's own. */
 export function localize(
   scene: string,
-  { start, ...asked }: { image: string; start: readonly number[]; probe: Probe | null } & Within,
+  { start, ...asked }: { image: string; start: readonly number[]; probe: Probe | null } & (Within | { search: "anywhere" }),
   signal: AbortSignal,
 ): Promise<Located> {
   return postJson("/v1/scenes/{scene}:localize", { scene }, { ...asked, start: poseBody(start) }, signal);

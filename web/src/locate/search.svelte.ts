@@ -61,6 +61,8 @@ function looksLikeFan({ data, width, height }: ImageData): boolean {
 /** A search for where a real frame was taken, kept while other views are shown. */
 export class Search extends Attempt {
   within = $state.raw(Object.fromEntries(WITHIN.map(({ name, field }) => [name, field.default])) as unknown as Within);
+  /** Looked for along the whole sweep, wherever the probe is. */
+  anywhere = $state(false);
   frame = $state.raw<RealFrame | null>(null);
   /** Addresses of the given frame and of the scene at the pose that was found. */
   given = $state<string | null>(null);
@@ -93,14 +95,15 @@ export class Search extends Attempt {
     }
   }
 
-  /** Looks for the frame about where the probe is now. */
+  /** Looks for the frame about where the probe is now, or anywhere. */
   async start(): Promise<void> {
     if (this.frame === null) return;
-    const { session, within, frame } = this;
+    const { session, within, frame, anywhere } = this;
     this.#forgetResult();
     await this.run(async (signal) => {
       const [start, probe] = [session.pose, session.chosenProbe];
-      this.located = await localize(session.name, { image: base64(frame.bytes), start, probe, ...within }, signal);
+      const about = anywhere ? { search: "anywhere" as const } : within;
+      this.located = await localize(session.name, { image: base64(frame.bytes), start, probe, ...about }, signal);
       const { picture } = await renderPicture(session.name, this.located.pose.flat(), { probe }, signal);
       this.#replace("rendered", picture);
     });
