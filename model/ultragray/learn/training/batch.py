@@ -59,7 +59,7 @@ class Batch:
 
     def halved(self, shadowed: Tensor) -> tuple[Batch, Tensor]:  # [F, H, W] -> [F', H / 2, W / 2]
         """With images of half as many rows and columns, and the shadows of its neighbours likewise."""
-        used, neighbours = self.neighbours.unique(return_inverse=True)
+        used, neighbours = torch.unique(self.neighbours, return_inverse=True)
         weights = None if self.weights is None else avg_pool2d(self.weights, 2)
         halved = replace(self, truth=avg_pool2d(self.truth, 2), weights=weights, neighbours=neighbours)
         return halved, shadowed[used.to(shadowed.device), ::2, ::2].contiguous()
