@@ -8,12 +8,14 @@ import type { Library, Rendered } from "./library.js";
 import { Thread } from "./thread.js";
 import type { LoadRequest } from "./worker.js";
 
+const MOST_WAIT_MS = 3000; // for helpers, whose shares are as large as the first worker's, once that has drawn its own
 const STRIP = 64; // shares of scan lines end at multiples of it, or at the last one (ultragray_draw)
 
 export class Crew {
   #helpers: Thread[] | undefined; // undefined: no frame was wide enough yet
   #ready: Thread[] = []; // those that have the scene
   #settings = new Map<number, string>(); // of views
+  #newest: Promise<unknown> = Promise.resolve(); // frame
 
   constructor(
     private readonly library: Library,
@@ -31,8 +33,18 @@ export class Crew {
     for (const thread of this.#ready) thread.ask({ act: "freeView", view }).catch(() => undefined);
   }
 
-  /** The frame of a pose and a view, `at` in the library, and how many drew it; undefined where there are no helpers for it. */
-  async render(view: number, at: number, pose: readonly number[]): Promise<(Rendered & { workers: number }) | undefined> {
+  /** The frame of a pose and a view, `at` in the library, and how many drew it; undefined where there are no helpers for it.
+   *
+   * One frame after another, so that answers are taken while they are waited for. A helper that fails, as where its memory
+   * does not suffice, or does not answer is dropped, and the first worker draws its lines, too.
+   */
+  render(view: number, at: number, pose: readonly number[]): Promise<(Rendered & { workers: number }) | undefined> {
+    const frame = this.#newest.then(() => this.#render(view, at, pose));
+    this.#newest = frame.catch(() => undefined);
+    return frame;
+  }
+
+  async #render(view: number, at: number, pose: readonly number[]): Promise<(Rendered & { workers: number }) | undefined> {
     const { height, width, planes } = this.library.plan(at, pose);
     const strips = Math.ceil(width / STRIP);
     if (strips > 1) this.#start();
@@ -41,20 +53,25 @@ export class Crew {
     const rows = height * planes.filter(Boolean).length;
     const end = (share: number): number => Math.min(width, STRIP * Math.round((share * strips) / (helpers.length + 1)));
     const lines = [0, ...helpers].map((_, share) => ({ first: end(share), end: end(share + 1), floats: rows * (end(share + 1) - end(share)) }));
-    const drawn = helpers.map((thread, number) => thread.ask<Float32Array>({ act: "draw", view, pose, ...lines[number + 1]! }));
-    try {
-      const own = async (): Promise<Float32Array> => this.library.draw(at, pose, lines[0]!);
-      const parts = await Promise.all([own(), ...drawn]);
-      const whole = new Float32Array(rows * width);
-      parts.forEach((part, share) => {
-        const { first, end } = lines[share]!;
-        for (let row = 0, size = end - first; row < rows; row++) whole.set(part.subarray(row * size, (row + 1) * size), row * width + first);
-      });
-      return { ...this.library.finish(at, pose, whole), workers: parts.length };
-    } catch (error) {
-      for (const thread of this.#ready.splice(0)) thread.close(); // its memory does not suffice, or it has ended
-      throw error;
-    }
+    const asked = helpers.map((thread, number) => thread.ask<Float32Array>({ act: "draw", view, pose, ...lines[number + 1]! }).catch(() => undefined));
+    const own = this.library.draw(at, pose, lines[0]!);
+    let timer;
+    const late = new Promise<undefined>((resolve) => (timer = setTimeout(resolve, MOST_WAIT_MS)));
+    const drawn = await Promise.all(asked.map((part) => Promise.race([part, late])));
+    clearTimeout(timer);
+    helpers.filter((_, number) => !drawn[number]).forEach((thread) => this.#drop(thread));
+    const whole = new Float32Array(rows * width);
+    [own, ...drawn].forEach((part, share) => {
+      const { first, end } = lines[share]!;
+      part ??= this.library.draw(at, pose, lines[share]!);
+      for (let row = 0, size = end - first; row < rows; row++) whole.set(part.subarray(row * size, (row + 1) * size), row * width + first);
+    });
+    return { ...this.library.finish(at, pose, whole), workers: 1 + drawn.filter(Boolean).length };
+  }
+
+  #drop(thread: Thread): void {
+    this.#ready = this.#ready.filter((one) => one !== thread);
+    thread.close();
   }
 
   #start(): void {

@@ -51,7 +51,7 @@ function prepare(view: number, settings: string): string {
   return prepared.info;
 }
 
-/** A frame, and what drew it: where the GPU or the crew fails, as for a device that was lost, this worker draws, or says what is wrong. */
+/** A frame, and what drew it: where the GPU fails, as a device that was lost, this worker draws, or says what is wrong. */
 async function render(view: number, pose: readonly number[]): Promise<Drawn> {
   const at = views.get(view)!;
   try {
@@ -59,7 +59,7 @@ async function render(view: number, pose: readonly number[]): Promise<Drawn> {
   } catch {
     if (gpu?.isLost) gpu = undefined;
   }
-  const together = await crew?.render(view, at, pose).catch(() => undefined);
+  const together = await crew?.render(view, at, pose);
   return { renderer: "wasm", workers: 1, ...(together ?? library.render(at, pose)) };
 }
 

@@ -116,25 +116,44 @@ test("several workers draw in Firefox, too", { skip: missing ?? false }, async (
   }
 });
 
-test("a worker that fails costs no frame: the first one draws alone", async () => {
-  cpSync(site.folder, `${site.folder}-failing`, { recursive: true });
-  const fails = `;const given = onmessage;
-    onmessage = (event) => event.data.request.act === "draw" ? postMessage({ number: event.data.number, problem: "the memory does not suffice" }) : given(event);`;
-  appendFileSync(path.join(`${site.folder}-failing`, "worker.js"), fails);
-  renameSync(`${site.folder}-failing`, path.join(site.folder, "failing"));
-  const page = await browser.newPage();
-  await page.goto(`${url}page.json`);
-  const drawn = await page.evaluate(async (folder) => {
-    const { Scene } = await import(`${folder}/index.js`);
-    const scene = await Scene.load("demo.ugr", { renderer: "wasm", workers: 2 });
-    const { poses } = await (await fetch("page.json")).json();
-    const seen = [];
-    for (let k = 0; k < 60; k++) seen.push((await scene.render(poses[k % poses.length], { height: 20, width: 128 })).pixels().some((value) => value > 0), scene.workers === 1);
-    return seen.every(Boolean);
-  }, `${url}failing`);
-  assert.ok(drawn);
-  await page.close();
-});
+/** What is wrong with helpers that are to draw; the wait for one that does not answer is over as soon as it begins. */
+const FAULTS = {
+  fails: `const given = onmessage;
+    onmessage = ({ data }) => {
+      if (data.request.act !== "draw") return given({ data });
+      tell();
+      postMessage({ number: data.number, problem: "the memory does not suffice" });
+    };`,
+  "does not answer": `const [given, wait] = [onmessage, setTimeout];
+    onmessage = ({ data }) => data.request.act !== "draw" && given({ data });
+    globalThis.setTimeout = (act) => (tell(), wait(act, 0));`,
+};
+
+for (const [fault, code] of Object.entries(FAULTS))
+  test(`a worker that ${fault} is dropped, and costs no frame: the first one draws alone`, async () => {
+    const name = fault.replaceAll(" ", "-");
+    cpSync(site.folder, `${site.folder}-${name}`, { recursive: true });
+    const faulty = `;const tell = () => new BroadcastChannel("faults").postMessage(0); ${code}`;
+    appendFileSync(path.join(`${site.folder}-${name}`, "worker.js"), faulty);
+    renameSync(`${site.folder}-${name}`, path.join(site.folder, name));
+    const page = await browser.newPage();
+    await page.goto(`${url}page.json`);
+    const [frames, faults] = await page.evaluate(async (folder) => {
+      let faults = 0;
+      new BroadcastChannel("faults").onmessage = () => faults++;
+      const { Scene } = await import(`${folder}/index.js`);
+      const scene = await Scene.load("demo.ugr", { renderer: "wasm", workers: 2 });
+      const { poses } = await (await fetch("page.json")).json();
+      const render = async (pose) => (await scene.render(pose, { height: 20, width: 128 })).pixels().some((value) => value > 0) && scene.workers === 1;
+      const frames = [];
+      while (faults === 0) frames.push(await render(poses[0])); // until the helper has started
+      for (const pose of poses.slice(0, 20)) frames.push(await render(pose));
+      return [frames, faults];
+    }, `${url}${name}`);
+    assert.deepEqual([...new Set(frames)], [true]);
+    assert.equal(faults, 1);
+    await page.close();
+  });
 
 test("the page goes on without a network, is steered by keys, and keeps its policy", async () => {
   const context = await browser.newContext();
