@@ -76,6 +76,7 @@ test-faults: $(VENV)/installed-dev  ## processes killed at random: render worker
 test-fuzz: $(VENV)/installed-dev  ## 100,000 inputs that are nearly right, on every door and in every file format (ARGS="--seed N" for the same again)
 	ULTRAGRAY_FUZZ_INPUTS=100000 $(BIN)/pytest --numprocesses 2 --dist loadfile tests/fuzz $(ARGS)
 	ULTRAGRAY_TEST_LIBRARY_FRAMES=2000 $(BIN)/pytest --numprocesses 2 tests/model/library/test_library.py $(ARGS)
+	ULTRAGRAY_TEST_WEBGPU_SCENES=500 $(BIN)/pytest tests/model/library/test_webgpu.py $(ARGS)
 
 test-soak: $(VENV)/installed-dev  ## clients of all kinds for MINUTES (30) while processes are killed (RECORD=1: the result to tests/soak-run.json)
 	$(READY)
