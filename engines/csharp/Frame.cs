@@ -142,8 +142,17 @@ namespace Ultragray
             lock (this)
             {
                 settings = newer;
+                Renew();
+            }
+        }
+
+        /// <summary>Frames from here on are others, for other settings or a finer scene: the newest pose is asked for again.</summary>
+        internal void Renew()
+        {
+            lock (this)
+            {
                 SetSince = Asked + 1;
-                if (Asked > 0) Asked++; // the same pose again
+                if (Asked > 0) Asked++;
                 Monitor.PulseAll(this);
             }
         }

@@ -1,31 +1,37 @@
 using System;
+using System.IO;
 using System.Runtime.InteropServices;
 using System.Text;
 using System.Threading;
+using System.Threading.Tasks;
 
 namespace Ultragray
 {
     /// <summary>
-    /// Frames that this machine renders itself, by libultragray (ultragray.h): no service, no network. A thread of its own loads the
-    /// scene and renders the newest pose.
+    /// Frames that this machine renders itself, by libultragray (ultragray.h): no service, no network. One thread loads the scene,
+    /// another renders the newest pose. A compressed file (.ugz) is a scene as soon as its first part is there, and becomes finer as
+    /// the others arrive.
     /// </summary>
     public sealed class LocalFrames : IFrameSource
     {
         readonly Exchange exchange = new Exchange();
-        readonly Func<byte[]> read;
         readonly int threads;
         readonly Thread renderer;
-        bool isDisposed;
+        SceneHandle arrived; // since the renderer looked; null: none
+        volatile bool isDisposed;
 
-        /// <summary>`read` gives the bytes of a scene file, such as () => File.ReadAllBytes("demo.ugr").</summary>
-        public LocalFrames(Func<byte[]> read, RenderSettings settings = null, int threads = 1)
+        /// <summary>`open` gives a scene file, such as () => File.OpenRead("demo.ugz").</summary>
+        public LocalFrames(Func<Stream> open, RenderSettings settings = null, int threads = 1)
         {
-            this.read = read;
             this.threads = threads;
             exchange.Set(settings);
-            renderer = new Thread(Run) { IsBackground = true, Name = "ultragray" };
+            Whole = Task.Factory.StartNew(() => Load(open), TaskCreationOptions.LongRunning);
+            renderer = new Thread(Render) { IsBackground = true, Name = "ultragray" };
             renderer.Start();
         }
+
+        /// <summary>When frames are those of the whole file. Fails, in a sentence, where the rest of it is damaged or does not come.</summary>
+        public Task Whole { get; }
 
         public string Problem => exchange.Problem;
 
@@ -38,37 +44,53 @@ namespace Ultragray
 
         public bool Take(ref Frame frame) => exchange.Take(ref frame);
 
-        /// <summary>Ends it, without waiting: the thread frees the scene after the frame that it renders.</summary>
+        /// <summary>Ends it, without waiting: the scene is freed after the frame that is rendered, and the part that is read.</summary>
         public void Dispose()
         {
             lock (exchange) isDisposed = true;
             exchange.Pulse();
         }
 
-        /// <summary>Waits until the thread has freed the scene, after Dispose.</summary>
+        /// <summary>Waits until the scene is freed, after Dispose.</summary>
         public void Join() => renderer.Join();
 
-        void Run()
+        void Load(Func<Stream> open)
         {
             try
             {
-                byte[] file = read();
-                using (var scene = Native.ultragray_load(file, (UIntPtr)file.Length))
+                using (var stream = open())
                 {
-                    if (scene.IsInvalid) exchange.Tell(0, Native.Problem());
-                    else RenderAll(scene);
+                    var arrival = new Arrival(stream);
+                    bool isFirst = true;
+                    while (!arrival.IsWhole && !isDisposed)
+                    {
+                        arrival.Next();
+                        var size = (UIntPtr)arrival.Count;
+                        var scene = arrival.IsWhole ? Native.ultragray_load(arrival.Bytes, size) : Native.ultragray_load_part(arrival.Bytes, size);
+                        if (scene.IsInvalid) throw new InvalidDataException(Native.Problem());
+                        lock (exchange)
+                        {
+                            arrived?.Dispose();
+                            arrived = scene;
+                            if (isFirst) exchange.Pulse();
+                            else exchange.Renew();
+                            isFirst = false;
+                        }
+                    }
                 }
             }
             catch (Exception error) // of the reading, or there is no libultragray
             {
                 exchange.Tell(0, error.GetBaseException().Message);
+                throw;
             }
         }
 
-        void RenderAll(SceneHandle scene)
+        void Render()
         {
             var matrix = new double[16];
             var arriving = new Frame();
+            SceneHandle scene = null;
             ViewHandle view = null;
             long viewed = 0;
             while (true)
@@ -78,8 +100,14 @@ namespace Ultragray
                 RenderSettings settings;
                 lock (exchange)
                 {
-                    while (!isDisposed && exchange.Asked == exchange.Answered) Monitor.Wait(exchange);
+                    while (!isDisposed && (exchange.Asked == exchange.Answered || (scene == null && arrived == null))) Monitor.Wait(exchange);
                     if (isDisposed) break;
+                    if (arrived != null)
+                    {
+                        scene?.Dispose();
+                        scene = arrived;
+                        arrived = null;
+                    }
                     asked = exchange.Asked;
                     set = exchange.SetSince;
                     pose = exchange.Pose;
@@ -95,6 +123,7 @@ namespace Ultragray
                 else exchange.Tell(asked, Native.Problem());
             }
             view?.Dispose();
+            scene?.Dispose();
         }
 
         bool Render(ViewHandle view, ProbePose pose, long number, double[] matrix, Frame frame)
@@ -172,6 +201,9 @@ namespace Ultragray
 
             [DllImport(Library)]
             internal static extern SceneHandle ultragray_load(byte[] bytes, UIntPtr size);
+
+            [DllImport(Library)]
+            internal static extern SceneHandle ultragray_load_part(byte[] bytes, UIntPtr size);
 
             [DllImport(Library)]
             internal static extern void ultragray_free_scene(IntPtr scene);

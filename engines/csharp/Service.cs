@@ -1,5 +1,6 @@
 using System;
 using System.Collections.Generic;
+using System.IO;
 using System.Net.Http;
 using System.Net.Http.Headers;
 using System.Text;
@@ -68,11 +69,11 @@ namespace Ultragray
             return Answer<SceneDetails>(Address(name, ""));
         }
 
-        /// <summary>The scene file, for LocalFrames.</summary>
-        public async Task<byte[]> Download(string name)
+        /// <summary>The scene file, compressed, while it arrives: for LocalFrames.</summary>
+        public async Task<Stream> Download(string name)
         {
-            using (var answer = await Send(new HttpRequestMessage(HttpMethod.Get, Address(name, "/file"))))
-                return await answer.Content.ReadAsByteArrayAsync();
+            var answer = await Send(new HttpRequestMessage(HttpMethod.Get, Address(name, "/file.ugz")), HttpCompletionOption.ResponseHeadersRead);
+            return await answer.Content.ReadAsStreamAsync();
         }
 
         /// <summary>One frame.</summary>
@@ -144,9 +145,9 @@ namespace Ultragray
             }
         }
 
-        async Task<HttpResponseMessage> Send(HttpRequestMessage request)
+        async Task<HttpResponseMessage> Send(HttpRequestMessage request, HttpCompletionOption until = HttpCompletionOption.ResponseContentRead)
         {
-            var answer = await http.SendAsync(request);
+            var answer = await http.SendAsync(request, until);
             if (answer.IsSuccessStatusCode) return answer;
             using (answer)
             {

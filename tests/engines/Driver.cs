@@ -1,4 +1,4 @@
-// What the tests of the C# client do, by lines: `ask X Y Z`, `set HEIGHT WIDTH ENCODING OUTPUTS GAIN`, and the end of the input ends it.
+// What the tests of the C# client do, by lines: `ask X Y Z`, `set HEIGHT WIDTH ENCODING OUTPUTS GAIN`, `rest`, and the end of the input ends it.
 // Frames are told as they come: `frame SEQUENCE HEIGHT WIDTH CONFIDENCE SHA256`, and what is wrong when it changes: `problem SENTENCE`.
 
 using System;
@@ -26,11 +26,29 @@ static class Driver
         }
     }
 
-    /// `remote URL SCENE KEY` or `local FILE`: what changes between the two is this.
+    static readonly SemaphoreSlim rest = new SemaphoreSlim(0); // `rest`: what was kept back of a file may come
+
+    /// `remote URL SCENE KEY`, `local FILE` or `arriving FILE BYTES`, of which so many come at once: what changes between them is this.
     static IFrameSource Open(string[] words)
     {
         if (words[1] == "remote") return new Service(words[2], words.ElementAtOrDefault(4)).Stream(words[3], null, "driver");
-        return new LocalFrames(() => File.ReadAllBytes(words[2]));
+        return new LocalFrames(() => words[1] == "local" ? File.OpenRead(words[2]) : (Stream)new Arriving(words[2], int.Parse(words[3])));
+    }
+
+    sealed class Arriving : MemoryStream
+    {
+        readonly int first;
+
+        internal Arriving(string file, int first) : base(File.ReadAllBytes(file))
+        {
+            this.first = first;
+        }
+
+        public override int Read(byte[] buffer, int offset, int count)
+        {
+            if (Position == first) rest.Wait();
+            return base.Read(buffer, offset, Position < first ? (int)Math.Min(count, first - Position) : count);
+        }
     }
 
     static int Frames(IFrameSource source)
@@ -47,6 +65,7 @@ static class Driver
                     var pose = words.Skip(1).Select(double.Parse).ToArray();
                     source.Ask(pose.Length == 3 ? ProbePose.At(pose[0], pose[1], pose[2]) : new ProbePose(pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]));
                 }
+                else if (words[0] == "rest") rest.Release();
                 else source.Settings = new RenderSettings
                 {
                     Height = long.Parse(words[1]),
@@ -62,6 +81,7 @@ static class Driver
         reader.Start();
         Frame frame = null;
         string told = null;
+        (source as LocalFrames)?.Whole.ContinueWith(whole => Console.WriteLine("whole " + whole.Exception?.GetBaseException().Message));
         while (!Volatile.Read(ref isOver))
         {
             string problem = source.Problem;

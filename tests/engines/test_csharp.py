@@ -19,7 +19,7 @@ from ultragray.rendering.settings import RenderSettings
 from ultragray.rendering.tools import Tool
 
 from ..client.proxy import Proxy
-from ..model.library.test_library import of_python
+from ..model.library.test_library import Scene, loaded_library, of_python
 from .conftest import HERE
 
 KEY = "0123456789abcdef-engines"
@@ -61,11 +61,12 @@ def test_the_client_needs_no_type_beyond_net_standard(build, client):
     assert told == "of 2715\n"  # types of .NET Standard 2.1 as Mono has it
 
 
-def test_the_service_over_http(driver, start, service, data_folder, demo_scene):
+def test_the_service_over_http(driver, start, service, demo_scene):
     told = start(driver, "service", service.http, KEY).end()
     assert told[0] == "scenes demo probeless second"
     assert told[1] == "scene 400 linear 40 5"
-    assert told[2] == f"file {sha256((data_folder / 'demo.ugr').read_bytes())}"
+    file = httpx.get(f"{service.http}/v1/scenes/demo/file.ugz", headers={"X-API-Key": KEY})
+    assert told[2] == f"file {sha256(file.content)}"
     needle = {"kind": "needle", "tip_mm": [0, 0, 20], "hub_mm": [-20, 0, 5], "frame": "probe"}
     asked = {"height": 40, "outputs": ["bmode", "coverage"], "tools": [needle]}
     answer = rendered(service, position=(0, 2, 0), accept="application/octet-stream;dtype=float32", **asked)
@@ -251,6 +252,27 @@ def test_local_frames_are_those_of_python_byte_for_byte(driver, start, settings,
     assert sum_ == sha256(b"".join(one.tobytes() for one in shown.values()))
     assert (1, int(height), int(width)) == next(iter(shown.values())).shape
     assert float(confidence) == pytest.approx(extrapolation.confidence)
+
+
+def test_a_compressed_scene_is_rendered_while_it_arrives(driver, start, tmp_path):
+    file, damaged = tmp_path / "demo.ugz", tmp_path / "damaged.ugz"
+    GaussianScene.load(DEMO_FILE).save(file)
+    data = file.read_bytes()
+    begun = len(data) // 2  # within the third of four parts
+    damaged.write_bytes(data[:-100] + bytes([data[-100] ^ 1]) + data[-99:])
+    held = [Scene(loaded_library(), data[:end], "load_part") for end in (begun, len(data) - 1)]
+    held.append(Scene(loaded_library(), data))
+    two, three, four = (sha256(one.render({}, np.eye(4)[None])[1].tobytes()) for one in held)
+    assert len({two, three, four}) == 3
+    for name, problem, last in ((file, "", four), (damaged, "its part.03 is damaged: its checksum differs", three)):
+        program = start(driver, "frames", "arriving", name, begun)
+        program.say("ask", 0, 0, 0)
+        for expected in (two, last):
+            while not program.wait_for("frame").endswith(expected):  # but those of fewer parts
+                pass
+            program.say("rest")
+        assert program.wait_for("whole").endswith(problem)
+        program.end()
 
 
 def test_what_is_wrong_with_local_frames_is_told_in_a_sentence(driver, start, tmp_path):

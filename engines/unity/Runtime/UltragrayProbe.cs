@@ -115,11 +115,11 @@ namespace Ultragray.Unity
             return used;
         }
 
-        Func<byte[]> Reading(Service remote)
+        Func<Stream> Reading(Service remote)
         {
             string path = Path.Combine(Application.streamingAssetsPath, sceneFile), name = scene;
-            if (sceneFile != "") return () => File.ReadAllBytes(path);
-            return () => remote.Download(name).GetAwaiter().GetResult(); // on the thread that renders
+            if (sceneFile != "") return () => File.OpenRead(path);
+            return () => remote.Download(name).GetAwaiter().GetResult(); // on the thread that loads
         }
 
         /// <summary>Copies the first output: Unity's first row is the lowest one, and grey has three channels there.</summary>

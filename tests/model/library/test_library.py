@@ -6,6 +6,7 @@ import os
 import runpy
 import zlib
 from dataclasses import astuple, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -108,8 +109,8 @@ class Plan(ctypes.Structure):
     ]
 
 
-@pytest.fixture(scope="module")
-def library():
+@cache
+def loaded_library():
     path, header = c_library()
     assert header.is_file()
     loaded = ctypes.CDLL(str(path))
@@ -134,6 +135,11 @@ def library():
         function = getattr(loaded, f"ultragray_{name}")
         function.restype, function.argtypes = result, arguments
     return loaded
+
+
+@pytest.fixture(scope="module")
+def library():
+    return loaded_library()
 
 
 class Scene:
