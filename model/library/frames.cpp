@@ -5,7 +5,6 @@
 #include <cstring>
 
 #include "../kernels/render.hpp"
-#include "random.hpp"
 
 namespace ultragray::library {
 namespace {
@@ -109,6 +108,31 @@ uint16_t halved(float value) {
     uint32_t bits;
     std::memcpy(&bits, &value, sizeof bits);
     return uint16_t((bits + 0xfff + (bits >> 13 & 1) - (uint32_t(127 - 15) << 23)) >> 13);
+}
+
+// A step of SplitMix64 (G. Steele et al. 2014): 64 bits, each of which depends on all of a word.
+uint64_t mixed(uint64_t word) {
+    word += 0x9e3779b97f4a7c15;
+    word = (word ^ word >> 30) * 0xbf58476d1ce4e5b9;
+    word = (word ^ word >> 27) * 0x94d049bb133111eb;
+    return word ^ word >> 31;
+}
+
+// Two numbers from 0 to 1 that follow from seed and pose, as Display.of_frame draws them: of gain and dynamic range.
+std::array<double, 2> drawn_shares(uint64_t state, const Pose& pose) {
+    const auto take = [&](double number) {
+        uint64_t bits;
+        number += 0.0;  // -0 is 0
+        std::memcpy(&bits, &number, sizeof bits);
+        state = mixed(state ^ bits);
+    };
+    for (int i = 0; i < 3; ++i) {
+        for (const double one : pose.turn[i]) take(one);
+        take(pose.origin[i]);
+    }
+    std::array<double, 2> shares;
+    for (double& share : shares) share = double((state = mixed(state)) >> 11) / 9007199254740992.0;
+    return shares;
 }
 
 }  // namespace

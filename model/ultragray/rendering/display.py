@@ -5,7 +5,6 @@ Free of torch: doors take them. `show` of `ultragray.rendering.frames` applies t
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -82,10 +81,13 @@ class Display(Contract):
 
         So nothing depends on which frames are rendered beside it, nor in which order.
         """
-        key = hashlib.sha256(self.display_seed.to_bytes(8, "little") + (pose + 0.0).astype("<f8").tobytes()).digest()
-        drawn = dict(zip(_DRAWN, np.random.default_rng(list(key)).random(len(_DRAWN)), strict=True))
+        state = self.display_seed
+        for word in (pose[:3] + 0.0).astype("<f8").view("<u8").ravel().tolist():
+            state = _mixed(state ^ word)
         settled: dict[str, Any] = {f"{name}_between": () for name in _DRAWN}
-        for name, share in drawn.items():
+        for name in _DRAWN:
+            state = _mixed(state)
+            share = (state >> 11) / 2**53
             if between := getattr(self, f"{name}_between"):
                 settled[name] = float(between[0] + share * (between[1] - between[0]))
         return replace(self, **settled)
@@ -133,3 +135,11 @@ def true_to_scale(probe: Probe, height: int, max_side: int = MAX_IMAGE_SIDE) -> 
     if probe.is_true_to_scale:
         return AS_RENDERED
     return Display(pixel_mm=max(probe.scan_line_length_mm / height, probe.box_mm.longer_side / (max_side - 1)))
+
+
+def _mixed(word: int) -> int:
+    """A step of SplitMix64 (G. Steele et al. 2014): 64 bits, each of which depends on all of a word."""
+    word = (word + 0x9E3779B97F4A7C15) % 2**64
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+    word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
+    return word ^ word >> 31
