@@ -30,6 +30,7 @@ from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
 from ultragray.scene.edits import Edit
+from ultragray.scene.recipes import SceneRecipe
 from ultragray_service.core.clocks import ClockOffset
 from ultragray_service.core.recordings import RecordingView
 from ultragray_service.errors import STATUSES
@@ -56,6 +57,7 @@ ROOTS = {
     "RecordingView": RecordingView,
     "Specification": Specification,
     "Edit": Edit,
+    "SceneRecipe": SceneRecipe,
 }
 LEFT_OUT = {"device_set", "calibration"}  # files are uploaded with their dataset
 OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place

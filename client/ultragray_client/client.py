@@ -25,6 +25,7 @@ from ultragray_client.contract import (
     RecordingSettings,
     RecordingView,
     RenderSettings,
+    SceneRecipe,
     SliceSettings,
     Specification,
 )
@@ -156,6 +157,19 @@ class Scenes(Group[AnyConnection]):
         asked = {"into": into, "edits": list(edits), "private": private}
         request = message_of(asked, scenes_pb2.EditSceneRequest, scene=name)
         return Call("SceneService.EditScene", request, scene_from_message, timeout_s)
+
+    @operation
+    def from_labels(
+        self, recipe: SceneRecipe, *, into: str, private: bool = False, timeout_s: float | None = None
+    ) -> Call[Scene]:
+        """Makes the scene `into` of bodies of tissue, which nobody recorded; all of its labels are in `made_labels`.
+
+        Raises SceneExists, and InvalidArgument with the path of what is wrong.
+        """
+        asked = {**vars(recipe), "into": into, "private": private}
+        return Call(
+            "SceneService.MakeScene", message_of(asked, scenes_pb2.MakeSceneRequest), scene_from_message, timeout_s
+        )
 
 
 class Datasets(Group[AnyConnection]):

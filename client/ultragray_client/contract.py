@@ -66,6 +66,7 @@ __all__ = [
     "RenderJob",
     "RenderSettings",
     "Sampler",
+    "SceneRecipe",
     "SettingsUsed",
     "Shaft",
     "Shape",
@@ -76,6 +77,7 @@ __all__ = [
     "SplineSampler",
     "SteeredProbe",
     "ThinEdit",
+    "TissueBody",
     "Tool",
     "ToolFrame",
     "TrainJob",
@@ -735,6 +737,7 @@ class TrainJob:
     # paper: the released recipe.
     preset: str = "fast"
     settings: dict[str, Any] = field_of(default_factory=dict)  # Any training settings instead of the preset's.
+    start_scene: str | None = None  # Name of a scene to begin with, such as one made from labels.
     kind: Literal["train"] = field_of(default="train", repr=False, kw_only=True)
     # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
@@ -830,9 +833,9 @@ class MeshShape:
 
 @dataclass(frozen=True)
 class MapShape:
-    """The voxels of a label in a NIfTI label map. It can be cut out and relabelled, not inserted."""
+    """The voxels of a label in a label map. It can be cut out and relabelled, not inserted."""
 
-    data: str  # A NIfTI-1 file in base64, in mm of the scene's frame (RAS+).
+    data: str  # A NIfTI-1 or NRRD file in base64, in mm of the scene's frame (RAS+).
     format: str = "nii.gz"  # Of the file.
     label: int = 0  # Of the voxels; 0: of all that have one.
     kind: Literal["map"] = field_of(default="map", repr=False, kw_only=True)
@@ -943,3 +946,44 @@ class ThinEdit:
 
 
 Edit: TypeAlias = MoveEdit | CutEdit | MergeEdit | InsertEdit | LesionsEdit | RelabelEdit | ThinEdit
+
+
+@dataclass(frozen=True, kw_only=True)
+class TissueBody:
+    """What a label of the map stands for, or a shape. A later one lies over those before it."""
+
+    tissue: str  # What it consists of.
+    label: int | None = None  # Its number in the label map.
+    shape: Shape | None = None  # Or where it is.
+    name: str | None = None  # Of its label in the scene. Default: that of the tissue.
+    echo_db: float | None = None  # Over liver. Default: the tissue's.
+    attenuation: float | None = None  # One way, dB/(cm MHz). Default: the tissue's.
+    impedance: float | None = None  # MRayl. Default: the tissue's.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneRecipe(Imaging):
+    """A scene from labels: bodies of tissue, and a sweep that looks at them.
+
+    The scene's frame is that of the label map, mm, right-anterior-superior; without one, that of the shapes.
+    """
+
+    bodies: tuple[TissueBody, ...]  # What is there. Nothing is where none is.
+    label_map: str | None = None  # A label map (NIfTI-1, NRRD) in base64.
+    label_map_format: str = "nii.gz"  # Of that file.
+    # A CT (NIfTI-1, NRRD; Hounsfield units) in base64: of what no body covers, its values tell gas, fat, soft
+    # tissue and bone, within the skin.
+    ct: str | None = None
+    ct_format: str = "nii.gz"  # Of that file.
+    probe: Probe | None = None  # That scans. Default: a convex one of 60°, 120 mm deep.
+    towards: tuple[float, float, float] = (0.0, -1.0, 0.0)  # Direction of its beam.
+    along: tuple[float, float, float] = (0.0, 0.0, -1.0)  # Direction of the sweep, about at a right angle to that.
+    # A point that the middle of the sweep looks at. Default: the middle of the bodies.
+    middle_mm: tuple[float, float, float] | None = None
+    sweep_mm: float = 80.0  # Length of the sweep.
+    pose_count: int = 81  # Its frames.
+    image_size: int = 256  # Rows and scan lines of a frame.
+    level: float = 0.35  # Grey value of liver.
+    compensated: float = 0.54  # Attenuation, dB/(cm MHz), that the scanner's time-gain compensation takes out.
+    gaussian_count: int = 150000  # About as many Gaussians.
+    seed: int = 0  # Of texture and speckle.

@@ -8,7 +8,7 @@ along y, as the lumbar spine does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeAlias
@@ -111,14 +111,6 @@ class Tissue(IntEnum):
     DISC = 9
 
 
-def tissue_at(points_mm: Floats) -> LabelArray:  # [N, 3] -> [N]
-    """The `Tissue` at each point of the phantom's frame, mm. Raises InvalidArgument for another shape."""
-    points_mm = np.asarray(points_mm)
-    if points_mm.ndim != 2 or points_mm.shape[1] != 3:
-        raise InvalidArgument(f"points_mm must be [N, 3], got {list(points_mm.shape)}", field="points_mm")
-    return tissue_drawn(straightened(points_mm))
-
-
 def tissue_drawn(points: Floats) -> LabelArray:  # [N, 3] -> [N]
     x, _, z = points.T
     fascia = fascia_depth_mm(x)
@@ -202,15 +194,6 @@ ACOUSTICS: dict[Tissue, Acoustics] = {
     Tissue.DISC: Acoustics(0.9, -2.0),
 }
 COMPENSATED = 0.6  # dB/(cm·MHz) that the scanner's time-gain compensation expects
-
-
-def round_trip_db_per_mm() -> FloatArray:  # [tissues]
-    return np.array([0.2 * FREQUENCY_MHZ * ACOUSTICS[tissue].attenuation for tissue in Tissue])
-
-
-def backscatter_amplitudes() -> FloatArray:  # [tissues]
-    """Amplitude of each tissue's scatterers over those of muscle."""
-    return np.array([10.0 ** (ACOUSTICS[tissue].backscatter_db / 20.0) for tissue in Tissue])
 
 
 def lateral_sigma_mm(depth_mm: Floats) -> Floats:
@@ -376,3 +359,50 @@ INTERFACES: tuple[Interface, ...] = (
     ),
     Interface(_sheet(lambda x: BODY_DEPTH_MM + 0.0 * x), _within(17.0), (52.0, 57.0), 22.0, 8.0, 18.0, 0.05),
 )
+
+
+# A phantom: all that its images form from.
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Places of a tissue that are brighter or darker than others, beside speckle."""
+
+    noise: Level  # in [-1, 1]
+    strength_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """An anatomy by functions of points. Its tissues are numbers, 0 for what lies before the skin."""
+
+    acoustics: Sequence[Acoustics]  # by tissue
+    straightened: Callable[[Floats], Floats]  # [N, 3] -> [N, 3], into the drawing
+    tissue_drawn: Callable[[Floats], LabelArray]  # [N, 3] -> [N]
+    interfaces: tuple[Interface, ...]
+    textures: Mapping[int, Texture]  # by tissue
+
+    def tissue_at(self, points_mm: Floats) -> LabelArray:  # [N, 3] -> [N]
+        """The tissue at each point of the phantom's frame, mm. Raises InvalidArgument for another shape."""
+        points_mm = np.asarray(points_mm)
+        if points_mm.ndim != 2 or points_mm.shape[1] != 3:
+            raise InvalidArgument(f"points_mm must be [N, 3], got {list(points_mm.shape)}", field="points_mm")
+        return self.tissue_drawn(self.straightened(points_mm))
+
+    def round_trip_db_per_mm(self) -> FloatArray:  # [tissues]
+        return np.array([0.2 * FREQUENCY_MHZ * one.attenuation for one in self.acoustics])
+
+    def backscatter_amplitudes(self) -> FloatArray:  # [tissues]
+        """Amplitude of each tissue's scatterers over those of 0 dB."""
+        return np.array([10.0 ** (one.backscatter_db / 20.0) for one in self.acoustics])
+
+
+FASCICLES_DB = 9.0  # by which bundles of muscle fibres are brighter or darker
+SPINE = Phantom(
+    acoustics=[ACOUSTICS[tissue] for tissue in Tissue],
+    straightened=straightened,
+    tissue_drawn=tissue_drawn,
+    interfaces=INTERFACES,
+    textures={Tissue.MUSCLE: Texture(fascicles, FASCICLES_DB)},
+)
+tissue_at = SPINE.tissue_at

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ultragray.scene.gaussians import GaussianScene
 
 
+DEMOS = ("spine", "abdomen")  # the first is a file, the other is made when it is asked for
 DEMO_FILE = Path(__file__).with_name("spine.ugr")
 DEMO_PROBE = PHANTOM_PROBE
 DEMO_IMAGE_SIDE = PHANTOM_IMAGE_SIDE

@@ -18,7 +18,7 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, IntArray
 from ultragray.phantom import anatomy
-from ultragray.phantom.anatomy import Floats
+from ultragray.phantom.anatomy import SPINE, Floats, Phantom
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -26,7 +26,6 @@ BLOCK_MM = 8.0
 PER_MM3 = 8.0  # about five in a cell of the beam's resolution: speckle is fully developed
 LAST_BLOCKS = 256  # kept for calls of one frame each, about 20 MB: neighbouring frames share most of their blocks
 BAND_MM = 0.4  # scatterers this near to an interface are repeated on it
-FASCICLES_DB = 9.0  # by which bundles of muscle fibres are brighter or darker
 _SEED = 20261121
 _OFFSET = 1 << 20  # seeds are not negative
 _GRADIENT_STEP_MM = 1e-2
@@ -64,9 +63,10 @@ NOTHING = Scatterers(_VECTORS, _NUMBERS, _VECTORS, _VECTORS, _NUMBERS, _NUMBERS,
 
 
 class ScattererField:
-    """The scatterers of the phantom, each block made when a frame first needs it."""
+    """The scatterers of a phantom, each block made when a frame first needs it."""
 
-    def __init__(self) -> None:
+    def __init__(self, phantom: Phantom = SPINE) -> None:
+        self._phantom = phantom
         self._blocks: dict[tuple[int, int, int], Scatterers] = {}
 
     def slice(self, pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> Scatterers:
@@ -76,7 +76,7 @@ class ScattererField:
 
     def _block(self, index: tuple[int, int, int]) -> Scatterers:
         if index not in self._blocks:
-            self._blocks[index] = _made(index)
+            self._blocks[index] = _made(self._phantom, index)
         return self._blocks[index]
 
 
@@ -94,16 +94,17 @@ def _blocks_near(pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> I
 
 
 @lru_cache(maxsize=LAST_BLOCKS)
-def _made(index: tuple[int, int, int]) -> Scatterers:
+def _made(phantom: Phantom, index: tuple[int, int, int]) -> Scatterers:
     rng = np.random.default_rng([_SEED, *(i + _OFFSET for i in index)])
     count = round(PER_MM3 * BLOCK_MM**3)
     points: Float32Array = ((np.asarray(index) + rng.random((count, 3))) * BLOCK_MM).astype(np.float32)
-    drawn = anatomy.straightened(points)
-    labels = anatomy.tissue_drawn(drawn)
-    amplitudes = anatomy.backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
-    muscle = labels == anatomy.Tissue.MUSCLE
-    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * anatomy.fascicles(drawn[muscle]))
-    parts = [_on(interface, rng, points, drawn) for interface in anatomy.INTERFACES]
+    drawn = phantom.straightened(points)
+    labels = phantom.tissue_drawn(drawn)
+    amplitudes = phantom.backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
+    for tissue, texture in phantom.textures.items():
+        inside = labels == tissue
+        amplitudes[inside] *= 10.0 ** (texture.strength_db / 20.0 * texture.noise(drawn[inside]))
+    parts = [_on(interface, phantom, rng, points, drawn) for interface in phantom.interfaces]
     surface, normals, specular, diffuse, lobe = (np.concatenate(column) for column in zip(*parts, strict=True))
     heard = amplitudes != 0.0
     return Scatterers(
@@ -115,7 +116,7 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
 
 
 def _on(
-    interface: anatomy.Interface, rng: np.random.Generator, points: Floats, drawn: Floats
+    interface: anatomy.Interface, phantom: Phantom, rng: np.random.Generator, points: Floats, drawn: Floats
 ) -> tuple[Floats, ...]:  # [M, 3], [M, 3], [M], [M], [M]
     """The scatterers near an interface moved onto it, with its normals there and their amplitudes."""
     low, high = interface.depths_mm
@@ -124,7 +125,7 @@ def _on(
     close = np.abs(level) < 2.0 * BAND_MM  # the function is only roughly a distance
     near, level = near[close], level[close]
     shifted = (points[near] + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
-    steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
+    steps = [interface.level(phantom.straightened(there)) - level for there in shifted]
     gradient = np.stack(steps, axis=1) / _GRADIENT_STEP_MM  # of the interface's function, in the phantom's frame
     steepness = np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)
     kept = np.abs(level) < BAND_MM * steepness
@@ -157,12 +158,14 @@ DYNAMIC_RANGE_DB = 60.0
 MUSCLE_GREY = 0.23  # of muscle's scatterers at their mean power; fibres and fascia are brighter
 
 
-def simulate(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> ByteArray:  # [F, H, W]
-    """B-mode frames of the phantom from poses [F, 4, 4], mm: the same scatterers in all, the same on every call.
+def simulate(
+    poses: npt.ArrayLike, *, probe: Probe, height: int, width: int, phantom: Phantom = SPINE
+) -> ByteArray:  # [F, H, W]
+    """B-mode frames of a phantom from poses [F, 4, 4], mm: the same scatterers in all, the same on every call.
 
     Raises InvalidPose for poses that are not rigid.
     """
-    field, grid = ScattererField(), Grid.of(probe, height, width)
+    field, grid = ScattererField(phantom), Grid.of(probe, height, width, phantom)
     checked = check_poses(poses)
     frames = np.zeros((len(checked), height, width), dtype=np.uint8)
     for frame, pose in zip(frames, checked, strict=True):
@@ -177,7 +180,7 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     Raises InvalidPose for poses that are not rigid.
     """
     grid = Grid.of(probe, height, width)
-    per_mm = anatomy.round_trip_db_per_mm()[anatomy.Tissue.BONE]
+    per_mm = SPINE.round_trip_db_per_mm()[anatomy.Tissue.BONE]
     checked = check_poses(poses)
     maps = np.zeros((len(checked), height, width), dtype=np.float32)
     for attenuation, pose in zip(maps, checked, strict=True):
@@ -186,12 +189,14 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     return maps
 
 
-def tissues(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> ByteArray:  # [F, H, W]
-    """The `Tissue` in the middle of each pixel: the truth that a segmentation of `simulate`'s frames is held against.
+def tissues(
+    poses: npt.ArrayLike, *, probe: Probe, height: int, width: int, phantom: Phantom = SPINE
+) -> ByteArray:  # [F, H, W]
+    """The number of the tissue in the middle of each pixel: the truth of a segmentation of `simulate`'s frames.
 
     Raises InvalidPose for poses that are not rigid, and InvalidProbe for a probe of lines that are not upright.
     """
-    grid = Grid.of(probe, height, width)
+    grid = Grid.of(probe, height, width, phantom)
     checked = check_poses(poses)
     maps = np.zeros((len(checked), height, width), dtype=np.uint8)
     for labels, pose in zip(maps, checked, strict=True):
@@ -208,15 +213,16 @@ class Grid:
     width: int
     cell_mm: tuple[float, float]  # depth, lateral
     margins: tuple[int, int]  # cells before the first row, and beside the first column
+    phantom: Phantom = SPINE
 
     @classmethod
-    def of(cls, probe: Probe, height: int, width: int) -> Grid:
+    def of(cls, probe: Probe, height: int, width: int, phantom: Phantom = SPINE) -> Grid:
         """The grid of an image of H rows and W scan lines. Raises InvalidProbe unless these are upright."""
         if not probe.is_true_to_scale:
             raise InvalidProbe(f"the phantom is scanned along upright lines, got {probe}", field="probe")
         cell_mm = (probe.scan_line_length_mm / (CELLS_PER_ROW * height), probe.lines.span / width)
         depth_margin, lateral_margin = (math.ceil(MARGIN_MM / size) for size in cell_mm)
-        return cls(probe, height, width, cell_mm, (depth_margin, lateral_margin))
+        return cls(probe, height, width, cell_mm, (depth_margin, lateral_margin), phantom)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -244,7 +250,7 @@ class Grid:
         return inside, row[inside] * columns + column[inside]
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
-        return _tissue(pose, self.depths_mm, self.laterals_mm)
+        return self._tissue(pose, self.depths_mm, self.laterals_mm)
 
     def tissue_of_pixels(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [H, W]
         """The tissue in the middle of each pixel, which is the edge of two cells."""
@@ -252,7 +258,13 @@ class Grid:
         first = top + CELLS_PER_ROW // 2
         edges_mm = self.depths_mm - 0.5 * self.cell_mm[0]
         rows = edges_mm[first : first + CELLS_PER_ROW * self.height : CELLS_PER_ROW]
-        return _tissue(pose, rows, self.laterals_mm[left : left + self.width])
+        return self._tissue(pose, rows, self.laterals_mm[left : left + self.width])
+
+    def _tissue(self, pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:
+        across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
+        points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
+        found = self.phantom.tissue_at(points.reshape(-1, 3).astype(np.float32))
+        return found.reshape(len(depths_mm), len(laterals_mm))
 
     def above(self, per_mm: FloatArray) -> FloatArray:  # [R, C] -> [R, C]
         """The sum of something over each scan line, from the probe's face down to the middle of each cell."""
@@ -266,16 +278,10 @@ class Grid:
         return cells
 
 
-def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]
-    across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
-    points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
-    return anatomy.tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
-
-
 def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]
     """Mean square of the envelope over each pixel and the frequencies of the scanner, 1 in muscle."""
     gain_db = 0.2 * anatomy.FREQUENCY_MHZ * anatomy.COMPENSATED * grid.depths_mm[:, None]
-    loss_db = grid.above(anatomy.round_trip_db_per_mm()[grid.tissue(pose)])
+    loss_db = grid.above(grid.phantom.round_trip_db_per_mm()[grid.tissue(pose)])
     sensitivity = (10.0 ** ((gain_db - loss_db) / 20.0)).astype(np.float32)
     looks = [np.abs(_blurred(echoes * sensitivity, grid)) ** 2 for echoes in _echoes(field, grid, pose)]
     return grid.pixels(np.mean(looks, axis=0))

@@ -5,8 +5,6 @@ An edit makes a new scene. What it was made of, and by which edits, stands in it
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,41 +17,12 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import MAX_POSITION_MM
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of
-from ultragray.scene.shapes import Shape, point_field, turn_field, with_files
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from ultragray.scene.shapes import Shape, point_field, read_document, turn_field
+from ultragray.scene.tissues import TISSUES
 
 MAX_EDITS = 100
 MAX_LESIONS = 100
-MAX_DOCUMENT_BYTES = 1 << 26
 MADE_NAMES_BYTES = 100  # of a label's name
-
-
-@dataclass(frozen=True)
-class Tissue:
-    """Acoustics of what is inserted.
-
-    Attenuation one way, dB/(cm·MHz), from Culjat et al., A review of tissue substitutes for ultrasound imaging,
-    Ultrasound Med Biol 36:861 (2010), table 1; of a tumour the mean of soft tissue. Echo in dB over the tissue around,
-    as scanners' test objects have it: such levels vary between patients more than between tables.
-    """
-
-    attenuation: float
-    echo_db: float
-
-
-TISSUES = {
-    "cyst": Tissue(0.0022, -60.0),  # water
-    "blood": Tissue(0.2, -40.0),
-    "tumour": Tissue(0.54, -9.0),
-    "fat": Tissue(0.48, 6.0),
-    "tendon": Tissue(4.7, 9.0),
-    "calcification": Tissue(6.9, 15.0),  # cortical bone
-}
-COMPENSATED = 0.54  # dB/(cm·MHz), of soft tissue: what the time-gain compensation of the sweep's scanner took out
 
 
 @dataclass(frozen=True)
@@ -231,15 +200,7 @@ def read_edits(path: str | Path) -> tuple[Edit, ...]:
 
     Raises InvalidArgument, naming the edit and its field.
     """
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_DOCUMENT_BYTES:
-            raise ValueError("it is larger than a document of edits is")
-        text = path.read_text(encoding="utf-8")
-        document: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise InvalidArgument(f"{path} cannot be read as edits: {error}", field="edits") from None
-    return edits_of(with_files(document, path.parent))
+    return edits_of(read_document(Path(path), "edits"))
 
 
 def edits_of(document: Any) -> tuple[Edit, ...]:

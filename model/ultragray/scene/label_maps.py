@@ -1,22 +1,45 @@
-"""Labels in files: NIfTI-1 label maps, read by nibabel (extra `nifti`), and painted frames. Free of torch."""
+"""Labels in files: label maps in NIfTI-1, read by nibabel (extra `nifti`), and NRRD, and painted frames. Free of torch.
+
+The reader of NRRD is ours, as that of sequences is (`ultragray.datasets.plus_files`): pynrrd inflates whatever a header
+promises.
+"""
 
 from __future__ import annotations
 
+import re
 import zipfile
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
 from ultragray.scene.info import MAX_LABEL, UNPAINTED
 
-LABEL_MAP_SUFFIXES = (".nii", ".nii.gz")
+LABEL_MAP_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 MAX_VOXELS = 2**28
+_MAX_NRRD_HEADER_BYTES = 1 << 20
+_NRRD_TYPES = {
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **{"float": "f4", "double": "f8"},
+}
+_TO_RAS = {  # by the words of `space`
+    **dict.fromkeys(("right-anterior-superior", "ras"), (1.0, 1.0, 1.0)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (-1.0, 1.0, 1.0)),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (-1.0, -1.0, 1.0)),
+}
+_ZLIB_OR_GZIP = 47  # zlib's window bits for either kind of header
 
 
 class LabelMap(NamedTuple):
@@ -27,39 +50,79 @@ class LabelMap(NamedTuple):
 
 
 def read_label_map(path: str | Path) -> LabelMap:
-    """The labels of a NIfTI file, in mm of its own frame, right-anterior-superior (RAS+).
+    """The labels of a NIfTI or NRRD file, in mm of its own frame, right-anterior-superior (RAS+).
 
-    Raises InvalidArgument for what is no NIfTI file, no volume, more than MAX_VOXELS, or not whole numbers from 0 to
-    255; ExtraMissing where nibabel is not installed.
+    Raises InvalidArgument for what is no such file, no volume, more than MAX_VOXELS, or not whole numbers from 0 to
+    255; ExtraMissing where nibabel is needed and not installed.
     """
-    path = Path(path)
-    if not path.name.endswith(LABEL_MAP_SUFFIXES):
-        expected = " or ".join(LABEL_MAP_SUFFIXES)
-        raise InvalidArgument(f"a label map must end in {expected}, got {path.name!r}", field="label_map")
-    try:
-        import nibabel
-    except ImportError as error:
-        raise missing_extra(error, "reading label maps", field="label_map") from error
-    try:
-        image: Any = nibabel.load(path)
-        shape = tuple(side for place, side in enumerate(image.shape) if place < 3 or side != 1)
-        if len(shape) != 3 or not 0 < np.prod(shape, dtype=np.float64) <= MAX_VOXELS:
-            raise InvalidArgument(
-                f"label_map must be a volume of at most {MAX_VOXELS:,} voxels, it is {list(image.shape)}",
-                field="label_map",
-            )
-        values = np.asanyarray(image.dataobj).reshape(shape)
-    except InvalidArgument:
-        raise
-    except Exception as error:  # nibabel raises whatever the reading of a damaged file meets
-        reason = str(error).replace(str(path), path.name)  # not where a service keeps it
-        raise InvalidArgument(f"{path.name} cannot be read as NIfTI: {reason}", field="label_map") from None
+    values, affine = read_volume(path, field="label_map")
     if not (values.dtype.kind in "iuf" and (values >= 0).all() and (values <= MAX_LABEL).all()):
         raise InvalidArgument(f"label_map must hold numbers from 0 to {MAX_LABEL}", field="label_map")
     volume = values.astype(np.uint8)
     if not np.array_equal(volume, values):
         raise InvalidArgument("label_map must hold whole numbers: labels cannot be interpolated", field="label_map")
-    return LabelMap(volume, np.asarray(image.affine, np.float64))
+    return LabelMap(volume, affine)
+
+
+def read_volume(path: str | Path, *, field: str) -> tuple[npt.NDArray[Any], FloatArray]:  # [I, J, K], [4, 4]
+    """The values of a NIfTI or NRRD file, and the way from its voxels to mm, RAS+. Raises as `read_label_map`."""
+    path = Path(path)
+    if not path.name.endswith(LABEL_MAP_SUFFIXES):
+        *most, last = LABEL_MAP_SUFFIXES
+        raise InvalidArgument(f"{field} must end in {', '.join(most)} or {last}, got {path.name!r}", field=field)
+    try:
+        return _read_nrrd(path, field) if path.name.endswith(".nrrd") else _read_nifti(path, field)
+    except (InvalidArgument, ExtraMissing):
+        raise
+    except Exception as error:  # nibabel raises whatever the reading of a damaged file meets
+        kind = "NRRD" if path.name.endswith(".nrrd") else "NIfTI"
+        reason = str(error).replace(str(path), path.name)  # not where a service keeps it
+        raise InvalidArgument(f"{path.name} cannot be read as {kind}: {reason}", field=field) from None
+
+
+def _read_nifti(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
+    try:
+        import nibabel
+    except ImportError as error:
+        raise missing_extra(error, "reading label maps", field=field) from error
+    image: Any = nibabel.load(path)
+    shape = tuple(side for place, side in enumerate(image.shape) if place < 3 or side != 1)
+    _check_volume(shape, field)
+    return np.asanyarray(image.dataobj).reshape(shape), np.asarray(image.affine, np.float64)
+
+
+def _check_volume(shape: Sequence[int], field: str) -> None:
+    if len(shape) != 3 or not 0 < np.prod(shape, dtype=np.float64) <= MAX_VOXELS:
+        raise InvalidArgument(
+            f"{field} must be a volume of at most {MAX_VOXELS:,} voxels, it is {list(shape)}", field=field
+        )
+
+
+def _read_nrrd(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
+    """Raises ValueError, KeyError, OSError, zlib.error for another file than of one volume, raw or gzip."""
+    data = path.read_bytes()
+    end = re.search(rb"\r?\n\r?\n", data[:_MAX_NRRD_HEADER_BYTES])
+    if not data.startswith(b"NRRD000") or end is None:
+        raise ValueError("it does not begin as one does")
+    head, body = data[: end.start()].decode("utf-8", errors="replace"), data[end.end() :]
+    lines = (line.partition(": ") for line in head.splitlines()[1:])
+    fields = {key.lower(): value.strip() for key, colon, value in lines if colon}
+    shape = [int(size) for size in fields["sizes"].split()]
+    _check_volume(shape, field)
+    encoding, dtype = fields["encoding"].lower(), np.dtype(_NRRD_TYPES[fields["type"].lower()])
+    if encoding not in ("raw", "gzip", "gz") or "data file" in fields or "datafile" in fields:
+        raise ValueError(f"its voxels must be in it, raw or gzip, they are {encoding}")
+    expected = dtype.itemsize * int(np.prod(shape))
+    voxels = body if encoding == "raw" else zlib.decompressobj(_ZLIB_OR_GZIP).decompress(body, expected)
+    if len(voxels) < expected:
+        raise ValueError(f"truncated: it holds {len(voxels)} of {expected} bytes")
+    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
+    values = np.frombuffer(voxels[:expected], dtype.newbyteorder(order)).reshape(shape, order="F")
+    vectors = re.findall(r"\(([^)]*)\)", f"{fields['space directions']} {fields['space origin']}")
+    affine = np.eye(4)
+    affine[:3] = np.array([[float(value) for value in vector.split(",")] for vector in vectors]).T
+    affine[:3] *= np.array(_TO_RAS[fields["space"].lower()])[:, None]
+    return values, affine
 
 
 PAINTED_SUFFIX = ".npz"

@@ -8,6 +8,8 @@ from __future__ import annotations
 import base64
 import binascii
 import io
+import json
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -25,12 +27,18 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of
 from ultragray.installation import missing_extra
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MAX_DOCUMENT_BYTES = 1 << 26
 MAX_SIZE_MM, LEAST_SIZE_MM = 1000.0, 0.1
 MAX_TUBE_POINTS = 1000
 MAX_FACES = 200_000  # of a mesh
 SURFACE_POINTS = 40_000  # that stand for the surface of a mesh
 MESH_FORMATS = ("stl", "obj", "ply")
-MAP_FORMATS = ("nii", "nii.gz")
+MAP_FORMATS = ("nii", "nii.gz", "nrrd")
 _HASHED = "sha256:"  # begins the data of a shape that a scene file tells of
 
 
@@ -52,6 +60,7 @@ class Shape(Family):
 
     kind: str
     has_surface = True  # whether `distance_mm` is a distance: what is inserted needs one
+    is_in_space = True  # whether it is anything without a scene
 
     def distance_mm(self, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [N]
         """The signed distance of points, negative inside."""
@@ -246,9 +255,9 @@ class MeshShape(_OfFile, Shape):
 
 @dataclass(frozen=True)
 class MapShape(_OfFile, Shape):
-    """The voxels of a label in a NIfTI label map. It can be cut out and relabelled, not inserted."""
+    """The voxels of a label in a label map. It can be cut out and relabelled, not inserted."""
 
-    data: str = described("A NIfTI-1 file in base64, in mm of the scene's frame (RAS+).")
+    data: str = described("A NIfTI-1 or NRRD file in base64, in mm of the scene's frame (RAS+).")
     format: str = described("Of the file.", "nii.gz", choices=MAP_FORMATS)
     label: int = described("Of the voxels; 0: of all that have one.", 0, low=0, high=255)
     kind: Literal["map"] = kind_field("map")
@@ -275,6 +284,13 @@ class MapShape(_OfFile, Shape):
         found[known] = np.where(inside[tuple(places[known].T)], -1.0, 1.0)
         return found
 
+    def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
+        inside, to_voxels = self._map
+        corners = np.argwhere(np.ones((2, 2, 2))) * np.array(inside.shape) - 0.5
+        to_mm = np.linalg.inv(to_voxels)
+        places = corners @ to_mm[:3, :3].T + to_mm[:3, 3]
+        return places.min(axis=0), places.max(axis=0)
+
 
 @dataclass(frozen=True)
 class LabelShape(Shape):
@@ -282,19 +298,30 @@ class LabelShape(Shape):
 
     name: str = described("Of the label, as the scene names it.")
     kind: Literal["label"] = kind_field("label")
-    has_surface = False
+    has_surface = is_in_space = False
 
 
-def with_files(document: Any, folder: Path) -> Any:
-    """A document of edits in which `file`, a path beside it, has become the data of its shape.
+def read_document(path: Path, field: str) -> Any:
+    """A JSON file, or a TOML one, in which `file`, a path beside it, has become the data of its shape.
 
     Raises InvalidArgument, OSError.
     """
+    try:
+        if path.stat().st_size > MAX_DOCUMENT_BYTES:
+            raise ValueError(f"it is larger than {MAX_DOCUMENT_BYTES >> 20} MiB")
+        text = path.read_text(encoding="utf-8")
+        document: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InvalidArgument(f"{path} cannot be read as {field}: {error}", field=field) from None
+    return _with_files(document, path.parent)
+
+
+def _with_files(document: Any, folder: Path) -> Any:
     if isinstance(document, Sequence) and not isinstance(document, str):
-        return [with_files(one, folder) for one in document]
+        return [_with_files(one, folder) for one in document]
     if not isinstance(document, dict):
         return document
-    inner = {name: with_files(value, folder) for name, value in document.items()}
+    inner = {name: _with_files(value, folder) for name, value in document.items()}
     if "file" not in inner:
         return inner
     of_kind: Any = Shape.member(inner.get("kind"))

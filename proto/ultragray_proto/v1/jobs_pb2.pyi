@@ -125,7 +125,7 @@ class LiveJob(_message.Message):
     def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., recording: _Optional[str] = ..., scene: _Optional[str] = ..., version_every_s: _Optional[float] = ...) -> None: ...
 
 class TrainJob(_message.Message):
-    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels")
+    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels", "start_scene")
     class WorkerLabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -141,6 +141,7 @@ class TrainJob(_message.Message):
     MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
     MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
     WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    START_SCENE_FIELD_NUMBER: _ClassVar[int]
     dataset: str
     scene: str
     preset: str
@@ -149,7 +150,8 @@ class TrainJob(_message.Message):
     max_run_s: float
     min_memory_gb: int
     worker_labels: _containers.ScalarMap[str, str]
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    start_scene: str
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., start_scene: _Optional[str] = ...) -> None: ...
 
 class VoxelizeJob(_message.Message):
     __slots__ = ("scene", "field", "spacing_mm", "box_mm", "format", "max_run_s", "device", "min_memory_gb", "worker_labels")

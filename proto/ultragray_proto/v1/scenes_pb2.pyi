@@ -272,6 +272,68 @@ class EditSceneRequest(_message.Message):
     private: bool
     def __init__(self, scene: _Optional[str] = ..., into: _Optional[str] = ..., edits: _Optional[_Iterable[_Union[Edit, _Mapping]]] = ..., private: _Optional[bool] = ...) -> None: ...
 
+class MakeSceneRequest(_message.Message):
+    __slots__ = ("probe", "frequency_mhz", "dynamic_range_db", "bodies", "label_map", "label_map_format", "ct", "ct_format", "towards", "along", "middle_mm", "sweep_mm", "pose_count", "image_size", "level", "compensated", "gaussian_count", "seed", "into", "private")
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_MHZ_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
+    BODIES_FIELD_NUMBER: _ClassVar[int]
+    LABEL_MAP_FIELD_NUMBER: _ClassVar[int]
+    LABEL_MAP_FORMAT_FIELD_NUMBER: _ClassVar[int]
+    CT_FIELD_NUMBER: _ClassVar[int]
+    CT_FORMAT_FIELD_NUMBER: _ClassVar[int]
+    TOWARDS_FIELD_NUMBER: _ClassVar[int]
+    ALONG_FIELD_NUMBER: _ClassVar[int]
+    MIDDLE_MM_FIELD_NUMBER: _ClassVar[int]
+    SWEEP_MM_FIELD_NUMBER: _ClassVar[int]
+    POSE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    COMPENSATED_FIELD_NUMBER: _ClassVar[int]
+    GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    INTO_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
+    probe: _geometry_pb2.Probe
+    frequency_mhz: float
+    dynamic_range_db: float
+    bodies: _containers.RepeatedCompositeFieldContainer[TissueBody]
+    label_map: str
+    label_map_format: str
+    ct: str
+    ct_format: str
+    towards: _containers.RepeatedScalarFieldContainer[float]
+    along: _containers.RepeatedScalarFieldContainer[float]
+    middle_mm: _containers.RepeatedScalarFieldContainer[float]
+    sweep_mm: float
+    pose_count: int
+    image_size: int
+    level: float
+    compensated: float
+    gaussian_count: int
+    seed: int
+    into: str
+    private: bool
+    def __init__(self, probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., frequency_mhz: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., bodies: _Optional[_Iterable[_Union[TissueBody, _Mapping]]] = ..., label_map: _Optional[str] = ..., label_map_format: _Optional[str] = ..., ct: _Optional[str] = ..., ct_format: _Optional[str] = ..., towards: _Optional[_Iterable[float]] = ..., along: _Optional[_Iterable[float]] = ..., middle_mm: _Optional[_Iterable[float]] = ..., sweep_mm: _Optional[float] = ..., pose_count: _Optional[int] = ..., image_size: _Optional[int] = ..., level: _Optional[float] = ..., compensated: _Optional[float] = ..., gaussian_count: _Optional[int] = ..., seed: _Optional[int] = ..., into: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+
+class TissueBody(_message.Message):
+    __slots__ = ("tissue", "label", "shape", "name", "echo_db", "attenuation", "impedance")
+    TISSUE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    ECHO_DB_FIELD_NUMBER: _ClassVar[int]
+    ATTENUATION_FIELD_NUMBER: _ClassVar[int]
+    IMPEDANCE_FIELD_NUMBER: _ClassVar[int]
+    tissue: str
+    label: int
+    shape: Shape
+    name: str
+    echo_db: float
+    attenuation: float
+    impedance: float
+    def __init__(self, tissue: _Optional[str] = ..., label: _Optional[int] = ..., shape: _Optional[_Union[Shape, _Mapping]] = ..., name: _Optional[str] = ..., echo_db: _Optional[float] = ..., attenuation: _Optional[float] = ..., impedance: _Optional[float] = ...) -> None: ...
+
 class Edit(_message.Message):
     __slots__ = ("move", "cut", "merge", "insert", "lesions", "relabel", "thin")
     MOVE_FIELD_NUMBER: _ClassVar[int]

@@ -64,6 +64,11 @@ class SceneServiceStub:
                 request_serializer=ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
                 _registered_method=True)
+        self.MakeScene = channel.unary_unary(
+                '/ultragray.v1.SceneService/MakeScene',
+                request_serializer=ultragray_dot_v1_dot_scenes__pb2.MakeSceneRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
+                _registered_method=True)
 
 
 class SceneServiceServicer:
@@ -114,6 +119,13 @@ class SceneServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def MakeScene(self, request, context):
+        """Makes a scene that nobody recorded, from a label map or shapes of tissue. SCENE_EXISTS, INVALID_ARGUMENT.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_SceneServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -145,6 +157,11 @@ def add_SceneServiceServicer_to_server(servicer, server):
             'EditScene': grpc.unary_unary_rpc_method_handler(
                     servicer.EditScene,
                     request_deserializer=ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_scenes__pb2.Scene.SerializeToString,
+            ),
+            'MakeScene': grpc.unary_unary_rpc_method_handler(
+                    servicer.MakeScene,
+                    request_deserializer=ultragray_dot_v1_dot_scenes__pb2.MakeSceneRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_scenes__pb2.Scene.SerializeToString,
             ),
     }
@@ -309,6 +326,33 @@ class SceneService:
             target,
             '/ultragray.v1.SceneService/EditScene',
             ultragray_dot_v1_dot_scenes__pb2.EditSceneRequest.SerializeToString,
+            ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def MakeScene(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.SceneService/MakeScene',
+            ultragray_dot_v1_dot_scenes__pb2.MakeSceneRequest.SerializeToString,
             ultragray_dot_v1_dot_scenes__pb2.Scene.FromString,
             options,
             channel_credentials,

@@ -94,6 +94,7 @@ OPERATIONS = (
         "SceneService/LabelScene",
     ),
     _operation("scene.edit", _OPERATOR, "POST /v1/scenes/{scene}:edit", "SceneService/EditScene"),
+    _operation("scene.make", _OPERATOR, "POST /v1/scenes:from-labels", "SceneService/MakeScene"),
     _operation("scene.import", _OPERATOR, "PUT /v1/scenes/{scene}"),
     _operation("scene.delete", _OPERATOR, "DELETE /v1/scenes/{scene}", owned=True),
     _operation("registration.list", _READER, "GET /v1/registrations", "RegistrationService/ListRegistrations"),

@@ -42,7 +42,7 @@ _COMMANDS = {  # by the panels of the help
         "worker": (".worker:worker", "Take jobs from the queue, one at a time, until Ctrl-C."),
     },
     "Scenes and frames": {
-        "demo": (".scenes:demo", "Write the built-in demo scene."),
+        "demo": (".scenes:demo", "Write a built-in demo scene: a spine, or an abdomen."),
         "show": (".scenes:show", "Print what a scene file or a sweep says about itself."),
         "render": (".render:render", "Render frames from poses into one file or a folder of PNGs."),
         "export": (".scenes:export", "Write a scene as PLY or as a checkpoint of the released code."),
@@ -51,6 +51,7 @@ _COMMANDS = {  # by the panels of the help
         "calibrate": (".register:calibrate_app", "Register a robot or tracker to a scene."),
         "label": (".labels:label", "Label the Gaussians of a scene by a NIfTI map or by painted frames."),
         "edit": (".editing:edit", "Move, cut, merge, relabel or thin a scene, or insert lesions, as a new one."),
+        "from-labels": (".editing:from_labels", "Make a scene that nobody recorded, from a label map or meshes."),
         "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
         "slicer": (".scenes:slicer", "Write a scene file of 3D Slicer that shows a served scene live."),
         "import": (".scenes:import_scene", "Turn a PLY file or a released checkpoint into a scene file."),

@@ -1,6 +1,7 @@
 """`ultragray edit`: a new scene file of one that is moved, cut, merged, relabelled, thinned, or had something put in.
+`ultragray from-labels`: one of bodies of tissue, which nobody recorded.
 
-`ultragray scenes edit` has the service do the same, and takes the same options.
+`ultragray scenes edit` and `ultragray scenes from-labels` have the service do the same, and take the same options.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from typing import Annotated, Any
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
+from ultragray.exchange.poses import load_poses
 from ultragray.rendering.volumes import parse_box, parse_numbers
 from ultragray.scene.edits import (
-    TISSUES,
     CutEdit,
     Edit,
     InsertEdit,
@@ -25,15 +26,20 @@ from ultragray.scene.edits import (
     scenes_named,
 )
 from ultragray.scene.info import read_header
+from ultragray.scene.label_maps import LABEL_MAP_SUFFIXES
+from ultragray.scene.recipes import SceneRecipe, read_recipe
 from ultragray.scene.shapes import BoxShape, SphereShape
-from ultragray_service.cli.options import with_options
+from ultragray.scene.tissues import TISSUES
+from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.terminal import (
     COMPRESSED_SUFFIX,
     SCENE_SUFFIX,
     Force,
     Json,
     SceneFile,
+    argument,
     check_file,
+    option,
     output_option,
     single,
     tell,
@@ -120,3 +126,57 @@ def edit(
         "provenance": edited.info.provenance,
     }
     tell(f"wrote {output}: {edited.gaussian_count:,} Gaussians, of {', '.join(parents)}", document, as_json=json)
+
+
+_MAPS = ", ".join(LABEL_MAP_SUFFIXES)
+LabelsArgument = Annotated[
+    Path | None, argument(f"A label map ({_MAPS}) in mm; none where bodies are shapes.", metavar="[LABELS]")
+]
+TissueOption = Annotated[
+    Path | None,
+    option(
+        "What its labels stand for, or shapes: TOML with tables [[bodies]], and any field of a recipe.",
+        "--tissue",
+        shown=False,
+    ),
+]
+CtOption = Annotated[
+    Path | None, option(f"A CT ({_MAPS}), which tells the tissue of what no body covers.", "--ct", shown=False)
+]
+RECIPE_FIELDS = FieldsOf(
+    SceneRecipe,
+    *("probe", "frequency_mhz", "dynamic_range_db", "towards", "along", "middle_mm", "sweep_mm", "pose_count"),
+    *("image_size", "level", "compensated", "gaussian_count", "seed"),
+)
+
+
+@single(
+    "ultragray from-labels ct_labels.nii.gz -o liver.ugr --tissue liver.toml",
+    "ultragray from-labels -o phantom.ugr --tissue meshes.toml",
+    "ultragray from-labels labels.nrrd -o liver.ugr --tissue liver.toml --ct ct.nii.gz --sweep-mm 120",
+)
+@with_options
+def from_labels(
+    output: Annotated[Path, output_option("Scene file to write (.ugr or .ugz).")],
+    labels: LabelsArgument = None,
+    tissue: TissueOption = None,
+    ct: CtOption = None,
+    poses: Annotated[Path | None, poses_option(default="a sweep as towards and along say")] = None,
+    force: Force = False,
+    json: Json = False,
+    *,
+    recipe: Annotated[dict[str, Any], RECIPE_FIELDS],
+) -> None:
+    """All of it counts as not recorded, until a training refines it: ultragray train --start-scene."""
+    check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
+    asked = read_recipe(tissue, labels, ct, **recipe)
+    path = None if poses is None else load_poses(poses)
+
+    from ultragray.learn.synthesis.scene import scene_from_labels
+
+    with working("making the scene …"):
+        made = scene_from_labels(asked, poses=path)
+    made.save(output)
+    names = [*made.info.label_names.values()]
+    document = {"output": str(output), "gaussian_count": made.gaussian_count, "made_labels": names}
+    tell(f"wrote {output}: {made.gaussian_count:,} Gaussians, {', '.join(names)}", document, as_json=json)

@@ -27,8 +27,9 @@ from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
 from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray.scene.label_maps import parse_names, read_label_map, read_painted
+from ultragray.scene.recipes import read_recipe
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
-from ultragray_service.cli.editing import AskedEdits
+from ultragray_service.cli.editing import RECIPE_FIELDS, AskedEdits, CtOption, LabelsArgument, TissueOption
 from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
@@ -282,6 +283,30 @@ def edit_scene(
     body = {"into": into, "private": private, "edits": to_dict(edits.listed(), with_none=False)}
     scene = connection.json("POST", route("scenes", name, suffix=":edit"), body)
     tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, of {', '.join(scene['parents'])}", scene, as_json=json)
+
+
+@scenes_app.command(
+    "from-labels",
+    epilog=examples("ultragray scenes from-labels ct_labels.nii.gz --into liver --tissue liver.toml"),
+)
+@with_options
+@with_connection
+def make_scene(
+    connection: Connection,
+    into: Annotated[str, option("Name of the scene to make.", shown=False)],
+    labels: LabelsArgument = None,
+    tissue: TissueOption = None,
+    ct: CtOption = None,
+    private: Annotated[bool, option("Others do not see the scene that is made.", "--private")] = False,
+    json: Json = False,
+    *,
+    recipe: Annotated[dict[str, Any], RECIPE_FIELDS],
+) -> None:
+    """Have the service make a scene that nobody recorded, from a label map or meshes."""
+    asked = to_dict(read_recipe(tissue, labels, ct, **recipe), with_none=False)
+    scene = connection.json("POST", route("scenes", suffix=":from-labels"), {**asked, "into": into, "private": private})
+    made = ", ".join(scene["made_labels"])
+    tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, {made}", scene, as_json=json)
 
 
 def _base64(data: bytes) -> str:

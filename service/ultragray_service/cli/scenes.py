@@ -15,6 +15,7 @@ import typer
 from ultragray.contract import to_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import InvalidArgument
+from ultragray.phantom.demo import DEMOS, copy_demo_scene
 from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
 from ultragray.scene.info import SceneInfo, read_header
 from ultragray_service.cli.options import with_options
@@ -41,17 +42,26 @@ if TYPE_CHECKING:
     pass
 
 
-@single("ultragray demo -o demo.ugr", "ultragray serve demo.ugr")
+@single("ultragray demo -o demo.ugr", "ultragray demo abdomen -o abdomen.ugr", "ultragray serve demo.ugr")
 def demo(
+    which: Annotated[str, argument(f"One of {', '.join(DEMOS)}.", metavar="[WHICH]")] = DEMOS[0],
     output: Annotated[Path, output_option("Scene file to write (.ugr).", default="demo.ugr")] = Path("demo.ugr"),
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """It needs no data and no training: a first frame takes seconds."""
-    from ultragray.phantom.demo import copy_demo_scene
-
+    """The spine was trained from a simulated sweep, and is there at once. The abdomen (liver, vessels, kidney, ribs,
+    gas) is made from labels, which takes half a minute.
+    """
+    if which not in DEMOS:
+        raise InvalidArgument(f"WHICH must be one of {', '.join(DEMOS)}, got {which!r}", field="which")
     check_file(output, [SCENE_SUFFIX], force=force)
-    copy_demo_scene(output)
+    if which == DEMOS[0]:
+        copy_demo_scene(output)
+    else:
+        from ultragray.phantom.recipes import make_abdomen
+
+        with working("making the scene …"):
+            make_abdomen().save(output)
     info = read_header(output).info
     tell(
         f"wrote {output}: {info.dataset_name}, {info.gaussian_count:,} Gaussians",

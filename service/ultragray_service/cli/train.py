@@ -16,6 +16,7 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
+from ultragray.scene.info import read_header
 from ultragray_service.cli.app import INTERRUPTED
 from ultragray_service.cli.options import FieldsOf, parse_settings, with_options
 from ultragray_service.cli.sweeps import SweepArgument, check_source, read_dataset, warn_about_dataset
@@ -66,6 +67,10 @@ def train(
         list[str] | None,
         option("Any field of TrainingConfig; repeat.", "--set", metavar="NAME=VALUE", shown=False, panel=RUN),
     ] = None,
+    start_scene: Annotated[
+        Path | None,
+        option("Scene file to begin with, such as one of `ultragray from-labels`.", shown=False, panel=RUN),
+    ] = None,
     folder: Annotated[
         Path | None, option("Folder of the run: checkpoint, metrics.jsonl, config.json.", shown="OUTPUT.run", panel=RUN)
     ] = None,
@@ -97,7 +102,10 @@ def train(
         tensorboard=tensorboard,
         device=device,
         backend=backend,
+        start_scene=start_scene,
     )
+    if start_scene is not None:
+        read_header(start_scene)
     if resume:
         _check_resumable(run)
     elif not force and run.checkpoint is not None:
@@ -130,6 +138,7 @@ class RunOptions:
     tensorboard: bool
     device: str
     backend: str
+    start_scene: Path | None
 
     @property
     def checkpoint(self) -> Path | None:
@@ -171,6 +180,7 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
 
 
 def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bool) -> None:
+    from ultragray import GaussianScene
     from ultragray.learn.training import train as train_scene
     from ultragray.learn.training.run import scene_of_checkpoint
 
@@ -188,6 +198,7 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
                 scene = train_scene(
                     dataset,
                     config,
+                    start=None if run.start_scene is None else GaussianScene.load(run.start_scene),
                     folder=run.folder,
                     resume=run.resume,
                     report=report,

@@ -1,14 +1,19 @@
-"""Edits of scenes, as all front doors ask for them: a scene of another name, which tells its parents."""
+"""Edits of scenes, and scenes made from labels, as all front doors ask for them: a scene of another name, which tells
+what it was made of.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import SceneFileInvalid
 from ultragray.scene.edits import MAX_EDITS, Edit, check_edits, scenes_named
+from ultragray.scene.recipes import SceneRecipe
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import Owners
 from ultragray_service.core.life import Life
@@ -16,7 +21,7 @@ from ultragray_service.core.scenes import Scene, scene_to_blame
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.core.uploads import SceneImports
 from ultragray_workers.jobs.owners import Kind
-from ultragray_workers.scene_edits import edit_scene_file
+from ultragray_workers.scene_edits import edit_scene_file, make_scene_file
 from ultragray_workers.scenes import SceneStore
 
 EDITING_TIMEOUT_S = 600.0
@@ -31,8 +36,16 @@ class EditTarget(Contract):
     private: bool = described("Whether others may not see it.", False)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecipeTarget(SceneRecipe):
+    """A recipe, and the scene to make by it."""
+
+    into: str = described("The scene to make.")
+    private: bool = described("Whether others may not see it.", False)
+
+
 class SceneEdits:
-    """Edits scenes in helper processes, one after another."""
+    """Edits scenes, and makes them from labels, in helper processes, one after another."""
 
     def __init__(
         self, store: SceneStore, imports: SceneImports, owners: Owners, processes: HelperProcesses, life: Life
@@ -49,11 +62,24 @@ class SceneEdits:
             names = dict.fromkeys((scene, *scenes_named(target.edits)))
             scenes = {name: str(await asyncio.to_thread(self._store.path, name)) for name in names}
 
+        edits = to_dict(target.edits)
+        return await self._made(target, edit_scene_file, "editing the scene", scenes=scenes, edits=edits)
+
+    async def make(self, target: RecipeTarget) -> Scene:
+        """Raises SceneExists, LimitReached, QueueFull, and what `scene_from_labels` raises."""
+        self._life.require_serving()
+        account().target = target.into
+        recipe = {item.name: to_dict(getattr(target, item.name)) for item in fields(SceneRecipe)}
+        return await self._made(target, make_scene_file, "making the scene", recipe=recipe)
+
+    async def _made(
+        self, target: EditTarget | RecipeTarget, work: Callable[..., None], what: str, **arguments: Any
+    ) -> Scene:
         async def make(made: Path, replaced: Path | None) -> None:
             await self._processes.run(
-                edit_scene_file,
-                {"scenes": scenes, "output": str(made), "edits": to_dict(target.edits)},
-                what="editing the scene",
+                work,
+                {"output": str(made), **arguments},
+                what=what,
                 timeout_s=EDITING_TIMEOUT_S,
                 killed=SceneFileInvalid,
             )

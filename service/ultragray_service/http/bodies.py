@@ -31,7 +31,7 @@ from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
 from ultragray.scene.edits import Edit
 from ultragray_service.core.clocks import ClockStamps
-from ultragray_service.core.editing import EditTarget
+from ultragray_service.core.editing import EditTarget, RecipeTarget
 from ultragray_service.core.labelling import LabelTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.recordings import MAX_NUMBER, IncomingFrame
@@ -291,6 +291,12 @@ class EditBody(EditTarget):
     """Edits, and the scene to make by them. Files of shapes are base64 in `data`."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecipeBody(RecipeTarget):
+    """Bodies of tissue, and the scene to make of them. Files are base64."""
+
+
+RECIPE_MAP = Apart("label_map", str, max_other_characters=2**26, max_bytes=2**27)
 EDITS = Apart("edits", list, Edit, max_characters=2**26, max_bytes=2**27)
 
 

@@ -22,7 +22,7 @@ from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, recordings_pb2
 from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_service.access.principals import Me, me
-from ultragray_service.core.editing import EditTarget
+from ultragray_service.core.editing import EditTarget, RecipeTarget
 from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
 from ultragray_service.core.labelling import LabelTarget
 from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, record
@@ -176,6 +176,7 @@ CALLS: Mapping[str, Call] = {
     "SceneService.LoadScene": lambda service, request: service.scenes.load(request.scene),
     "SceneService.LabelScene": _label_scene,
     "SceneService.EditScene": lambda service, request: service.edits.edit(request.scene, read(request, EditTarget)),
+    "SceneService.MakeScene": lambda service, request: service.edits.make(read(request, RecipeTarget)),
     "SceneService.UnloadScene": lambda service, request: service.scenes.unload(request.scene),
     "DatasetService.ListDatasets": lambda service, request: service.datasets.page(_size(request), request.page_token),
     "DatasetService.GetDataset": lambda service, request: service.datasets.get(request.dataset),

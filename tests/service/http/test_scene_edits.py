@@ -1,4 +1,4 @@
-"""Scenes that are edited through each door: new ones, which name their parents."""
+"""Scenes that are edited, or made from labels, through each door: new ones, which tell what they were made of."""
 
 import base64
 import json
@@ -8,12 +8,30 @@ import pytest
 from typer.testing import CliRunner
 
 from ultragray import GaussianScene
-from ultragray_client import Client, InsertEdit, LabelShape, MergeEdit, TubeShape, errors
+from ultragray_client import (
+    BoxShape,
+    Client,
+    InsertEdit,
+    LabelShape,
+    LinearProbe,
+    MergeEdit,
+    SceneRecipe,
+    TissueBody,
+    TubeShape,
+    errors,
+)
 from ultragray_service.cli.app import app
 
 KEY = "0123456789abcdef-edits"
 CYST = {"kind": "insert", "tissue": "cyst", "shape": {"kind": "sphere", "centre_mm": [0, 0, 12], "radius_mm": 3}}
 CUT = {"kind": "cut", "shape": {"kind": "box", "min_mm": [-30, -30, -5], "max_mm": [0, 30, 40]}}
+
+
+BLOCK = {"kind": "box", "min_mm": [-12, -8, 0], "max_mm": [12, 8, 24]}
+RECIPE = {
+    **{"bodies": [{"tissue": "liver", "shape": BLOCK}], "towards": [0, 0, 1], "along": [0, 1, 0]},
+    **{"probe": {"kind": "linear", "width_mm": 20, "near_mm": 0, "far_mm": 20}, "sweep_mm": 8, "gaussian_count": 1500},
+}
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +115,39 @@ def test_the_command_line_edits_files_and_scenes_of_a_service(service, demo_scen
     assert there.exit_code == 0, there.output
     assert json.loads(there.output)["made_labels"] == ["tumour"]
     assert runner.invoke(app, ["edit", "demo.ugr", "-o", "none.ugr"]).exit_code == 2
+
+
+def test_every_door_makes_scenes_from_labels(service, http, tmp_path, monkeypatch):
+    answer = http.post("/v1/scenes:from-labels", json={**RECIPE, "into": "made"})
+    assert answer.status_code == 201, answer.text
+    assert (answer.json()["made_labels"], answer.json()["parents"]) == (["liver"], {})
+    frame = http.post(
+        "/v1/scenes/made/render", json={"pose": {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}}
+    )
+    assert frame.status_code == 200, frame.text
+    assert json.loads(frame.headers["x-ultragray-extrapolation"])["supported_share"] == 0.0
+    block = BoxShape(min_mm=(-12.0, -8.0, 0.0), max_mm=(12.0, 8.0, 24.0))
+    probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
+    recipe = SceneRecipe(
+        bodies=(TissueBody(tissue="liver", shape=block),),
+        **{"towards": (0.0, 0.0, 1.0), "along": (0.0, 1.0, 0.0), "probe": probe, "sweep_mm": 8.0},
+        gaussian_count=1500,
+    )
+    with Client(service.grpc, api_key=KEY) as client:
+        assert client.scenes.from_labels(recipe, into="made-by-grpc").gaussian_count == answer.json()["gaussian_count"]
+        with pytest.raises(errors.SceneExists):
+            client.scenes.from_labels(recipe, into="made")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "block.json").write_text(json.dumps({name: RECIPE[name] for name in RECIPE if name != "sweep_mm"}))
+    asked = ["--tissue", "block.json", "--sweep-mm", "8", "--json"]
+    runner = CliRunner()
+    here = runner.invoke(app, ["from-labels", "-o", "block.ugr", *asked])
+    assert here.exit_code == 0, here.output
+    assert GaussianScene.load("block.ugr").gaussian_count == answer.json()["gaussian_count"]
+    address = ["--address", service.http, "--api-key", KEY]
+    there = runner.invoke(app, ["scenes", "from-labels", "--into", "made-by-command", *asked, *address])
+    assert there.exit_code == 0, there.output
+    refused = http.post(
+        "/v1/scenes:from-labels", json={**RECIPE, "into": "none", "bodies": [{"tissue": "liver", "label": 1}]}
+    )
+    assert (refused.status_code, refused.json()["field"]) == (422, "label_map")

@@ -35,9 +35,10 @@ from ultragray.rendering.frames import render
 from ultragray.rendering.volume_fields import sample_volume
 from ultragray.rendering.volumes import VolumeGrid
 from ultragray.scene.confidence import SUPPORT_COVERAGE
-from ultragray.scene.edits import COMPENSATED, TISSUES, InsertEdit, LesionsEdit
+from ultragray.scene.edits import InsertEdit, LesionsEdit
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.shapes import EllipsoidShape, Shape
+from ultragray.scene.tissues import SOFT_TISSUE_DB, TISSUES
 
 FINEST_MM, COARSEST_MM = 0.15, 0.35  # deviations of the Gaussians at the surface of a body
 _SPACING = 1.2  # of Gaussians, in their deviations: nine lie over each point
@@ -97,7 +98,7 @@ def _inserted(
     spread = min(1.0, target / max(level, _DARK))  # what is dark has little texture
     body = with_echo(body, torch.from_numpy(target + spread * np.asarray(echo)).to(body.means))
     attenuation = known.attenuation if edit.attenuation is None else edit.attenuation
-    lost_db = 2.0 * edit.frequency_mhz * max(0.0, attenuation - COMPENSATED)  # dB/cm, there and back
+    lost_db = 2.0 * edit.frequency_mhz * max(0.0, attenuation - SOFT_TISSUE_DB)  # dB/cm, there and back
     body = _attenuating(body, lost_db / (edit.dynamic_range_db * max(level, _DARK)), distance, bounds)
     body = with_label(body, np.ones(len(body.means), bool), edit.label_name)
     whole = body if outside is None else joined(outside, body)

@@ -276,7 +276,7 @@ def clipped(scene: GaussianScene, distance: Distance, sharpness: float) -> Gauss
     shrunk = (1.0 - (deviation / sigma).square())[:, None, None] * unit[:, :, None] * unit[:, None, :]
     variances, vectors = torch.linalg.eigh((covariance - shrunk).double())
     vectors[:, :, 0] *= torch.linalg.det(vectors).sign()[:, None]
-    quats = _quaternions(vectors.cpu().numpy())
+    quats = quaternions(vectors.cpu().numpy())
     ended = (1.0 - torch.sigmoid(cut.transmittances)) * share * sigma / deviation
     kept = (share > _LEAST_SHARE) & (mean < 0.0)
     splats = {
@@ -303,7 +303,7 @@ def _normals(distance: Distance, places: FloatArray) -> FloatArray:  # [N, 3] mm
     return normals
 
 
-def _quaternions(rotations: FloatArray) -> FloatArray:  # [N, 3, 3] -> [N, 4] wxyz
+def quaternions(rotations: FloatArray) -> FloatArray:  # [N, 3, 3] -> [N, 4] wxyz
     turns = turns_of(rotations)
     half = 0.5 * np.linalg.norm(turns, axis=1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * turns * np.sinc(half / np.pi)], axis=1)

@@ -18,6 +18,7 @@ from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInva
 from ultragray.files import write_whole
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.sweep import Dataset
+from ultragray.learn.synthesis.refinement import with_labels_of
 from ultragray.learn.training.checkpointing import read_checkpoint_header
 from ultragray.learn.training.confidence import LEAST_HELD_OUT, fit_confidence, held_out_frames, shorter, steps_of_fit
 from ultragray.learn.training.config import USUAL_EFFORT, TrainingConfig
@@ -104,6 +105,7 @@ def train(
     dataset: Dataset,
     config: TrainingConfig | None = None,
     *,
+    start: GaussianScene | None = None,
     folder: Path | None = None,
     resume: bool = False,
     report: Report | None = None,
@@ -115,6 +117,7 @@ def train(
 ) -> GaussianScene:
     """The scene trained from `dataset.train`, measured on `dataset.val` where that has frames.
 
+    `start`: a scene to begin with, such as one made from labels, which keep theirs: a few frames then refine it.
     `device` is cpu, cuda or cuda:N; the backend `auto` is the one for it. The same dataset, configuration and machine
     give the same scene, bit for bit on one thread of a CPU; random choices are the same on every device. `folder` keeps
     checkpoints, the journal and the configuration; with `resume` the run goes on from its checkpoint and ends in the
@@ -134,13 +137,13 @@ def train(
         raise TrainingStateInvalid(
             f"{checkpoint}: there is an unfinished run: resume it, or remove {folder} to begin anew"
         )
-    apart = _Apart(report, should_stop, device, backend)
+    apart = _Apart(report, should_stop, device, backend, start)
     given = config or TrainingConfig()
     config = _with_effort(dataset, given, folder, resume, apart)
     if config is None:
-        return Trainer(dataset, given, folder=None, device=device, backend=backend).scene()
+        return Trainer(dataset, given, folder=None, device=device, backend=backend, start=start).scene()
     try:
-        trainer = Trainer(dataset, config, folder=folder, device=device, backend=backend)
+        trainer = Trainer(dataset, config, folder=folder, device=device, backend=backend, start=start)
         if resume:
             trainer.restore()
     except torch.OutOfMemoryError as error:
@@ -152,6 +155,8 @@ def train(
         with trainer.logs(tensorboard) as log:
             trainer.run(log, _with_fit(report, dataset, trainer.config), should_stop, checkpoint_interval_s)
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
+    if start is not None:
+        scene = with_labels_of(start, scene, dataset.train)
     if is_finished:
         rest = scene.at_rest()
         refined = replace(dataset, train=replace(dataset.train, poses=rest.training_poses))
@@ -173,10 +178,11 @@ class _Apart:
     should_stop: Callable[[], bool] | None
     device: str
     backend: str
+    start: GaussianScene | None
 
     def scene(self, part: Dataset, config: TrainingConfig, purpose: str) -> GaussianScene | None:
         """None where it was told to stop. `purpose`: for those who are told of the progress."""
-        trainer = Trainer(part, config, folder=None, device=self.device, backend=self.backend)
+        trainer = Trainer(part, config, folder=None, device=self.device, backend=self.backend, start=self.start)
         report = self.report
 
         def tell(progress: Progress) -> None:

@@ -19,6 +19,7 @@ from ultragray.errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, T
 from ultragray.files import remove_stale_temporaries, write_whole
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, spread_places
+from ultragray.learn.synthesis.refinement import started_parameters
 from ultragray.learn.training.batch import Batch
 from ultragray.learn.training.beam import TrainedBeam
 from ultragray.learn.training.between import ViewsBetween, neighbours_of
@@ -31,7 +32,7 @@ from ultragray.learn.training.checkpointing import (
 )
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows
-from ultragray.learn.training.initial import initial_parameters
+from ultragray.learn.training.initial import Start, initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0
 from ultragray.learn.training.losses import SSIM_WINDOW
 from ultragray.learn.training.memory import (
@@ -64,8 +65,18 @@ class Trainer:
     """One run: its parameters and everything that changes with them."""
 
     def __init__(
-        self, dataset: Dataset, config: TrainingConfig, *, folder: Path | None, device: str, backend: str
+        self,
+        dataset: Dataset,
+        config: TrainingConfig,
+        *,
+        folder: Path | None,
+        device: str,
+        backend: str,
+        start: GaussianScene | None = None,
     ) -> None:
+        if start is not None:
+            most = max(start.gaussian_count, config.max_gaussians or 0)
+            config = replace(config, initial_gaussians=start.gaussian_count, max_gaussians=most)
         self._device = training_device(device, backend)
         if min(dataset.train.height, dataset.train.width) < SSIM_WINDOW:
             raise DatasetInvalid(
@@ -111,11 +122,15 @@ class Trainer:
         self._peak_memory_mb: float | None = None
         needs_shadows = config.transmittance and (config.start == "informed" or config.absorption_penalty > 0.0)
         shadows = Shadows(dataset.train) if needs_shadows else None
-        start = initial_parameters(dataset, neighbours, shadows, self._geometry, config, self._generator)
+        if start is None:
+            begin = initial_parameters(dataset, neighbours, shadows, self._geometry, config, self._generator)
+        else:
+            parameters = started_parameters(start, config, self._geometry.centre_mm)
+            begin = Start(parameters, torch.zeros(start.gaussian_count))
         self._shadowed: Tensor | None = None  # [F, H, W] pixels in which absorption has no price
         if shadows is not None and config.absorption_penalty:
             self._shadowed = torch.from_numpy(shadows.pixels()).to(self._device)
-        self._begin_with(start.parameters, start.floor)
+        self._begin_with(begin.parameters, begin.floor)
         self._backend = choose_backend(backend, self._view(sh_degree=0))
 
     def _begin_with(self, parameters: dict[str, Tensor], floor: Tensor) -> None:  # [N]

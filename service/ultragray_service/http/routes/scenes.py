@@ -39,12 +39,14 @@ from ultragray_service.http.bodies import (
     LABEL_MAP,
     LARGE_IMAGE,
     PAINTED_FRAMES,
+    RECIPE_MAP,
     AssessBody,
     EditBody,
     LabelBody,
     LabelMapBody,
     LocalizeBody,
     PlanBody,
+    RecipeBody,
     body_schema,
     read_json_body,
 )
@@ -189,6 +191,13 @@ async def edit_scene(request: Request, service: ServiceDep, scene: SceneName) ->
     body = await read_json_body(request, EditBody, EDITS)
     work = service.edits.edit(scene, body)
     return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
+
+
+@router.post(":from-labels", status_code=201, openapi_extra=body_schema(RecipeBody), responses=_LABELLED)
+async def make_scene(request: Request, service: ServiceDep) -> Scene:
+    """Makes a scene that nobody recorded, from a label map or shapes of tissue. Its labels are all in `made_labels`."""
+    body = await read_json_body(request, RecipeBody, RECIPE_MAP)
+    return await finish_or_abandon(service.edits.make(body), request.receive, time.monotonic() + PATIENCE_S)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.scene.confidence import Assessor
 from ultragray.scene.edits import (
-    TISSUES,
     CutEdit,
     InsertEdit,
     LesionsEdit,
@@ -42,6 +41,7 @@ from ultragray.scene.shapes import (
     SphereShape,
     TubeShape,
 )
+from ultragray.scene.tissues import TISSUES
 
 SIDE = 96
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)

@@ -87,8 +87,8 @@ class Specification(Family):
         super().__post_init__()
         check_device(self.device)
         check_labels(self.worker_labels, "worker_labels")
-        if self.needs_scene is not None:
-            check_scene_reference(getattr(self, self.needs_scene), self.needs_scene)
+        if self.needs_scene is not None and (scene := getattr(self, self.needs_scene)) is not None:
+            check_scene_reference(scene, self.needs_scene)
         if self.makes_scene is not None:
             check_scene_name(getattr(self, self.makes_scene), self.makes_scene)
 
@@ -149,7 +149,7 @@ def from_dict(document: Mapping[str, Any]) -> Specification:
 def value_in(document: Mapping[str, Any], role: str) -> str | None:
     """The dataset or scene that a job's JSON names in a role: needs_dataset, needs_scene or makes_scene."""
     field = getattr(Specification.member(document["kind"]), role)
-    return None if field is None else document[field]
+    return None if field is None else document.get(field)
 
 
 def has_checkpoints(document: Mapping[str, Any]) -> bool:

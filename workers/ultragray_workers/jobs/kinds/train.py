@@ -26,11 +26,13 @@ class TrainJob(Specification):
     scene: str = described("Name that the scene will be served under.")
     preset: str = described(PRESET_MEANINGS, "fast", choices=tuple(PRESETS))
     settings: dict[str, Any] = described("Any training settings instead of the preset's.", factory=dict)
+    start_scene: str | None = described("Name of a scene to begin with, such as one made from labels.", None)
     kind: Literal["train"] = kind_field("train")
 
     run_module = "ultragray_workers.jobs.kinds.train_run"
     has_checkpoints = True
     needs_dataset = "dataset"
+    needs_scene = "start_scene"
     makes_scene = "scene"
 
     def __post_init__(self) -> None:

@@ -131,6 +131,7 @@ def run(job_run: JobRun, job: TrainJob, *, better: GaussianScene | None = None, 
     scene = train_scene(
         dataset,
         config,
+        start=_start_of(job_run, job),
         folder=job_run.folder.run,
         resume=resume,
         report=lambda state: _report(job_run, state, finishing),
@@ -143,6 +144,12 @@ def run(job_run: JobRun, job: TrainJob, *, better: GaussianScene | None = None, 
     if better is not None and len(dataset.val):
         scene = _better(scene, better, dataset, by_db)
     return _finish(job_run, job, dataset, scene, device, finishing)
+
+
+def _start_of(job_run: JobRun, job: TrainJob) -> GaussianScene | None:
+    if job.start_scene is None:
+        return None
+    return GaussianScene.load(job_run.folder.path / f"{job.start_scene}{SUFFIX}")
 
 
 def _better(scene: GaussianScene, other: GaussianScene, dataset: Dataset, by_db: float) -> GaussianScene:

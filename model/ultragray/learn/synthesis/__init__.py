@@ -1,0 +1,1 @@
+"""Scenes made from labels (`ultragray.scene.recipes`), which nobody recorded."""

@@ -1,0 +1,81 @@
+"""Scenes made from labels as the start of a training: what frames show is then recorded, and the rest stays as it was
+made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from hashlib import sha256
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import BoolArray, FloatArray
+from ultragray.learn.editing.parts import as_sigmoid, label_number, means_mm
+from ultragray.learn.sweep import Sweep
+from ultragray.learn.training.config import TrainingConfig
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.info import expected_shapes
+
+SHOWN_MM = 1.5  # from the plane of a frame: as near is what it shows
+
+
+def started_parameters(start: GaussianScene, config: TrainingConfig, centre_mm: FloatArray) -> dict[str, Tensor]:
+    """The raw parameters of a scene about the centre of a training, with as many harmonics as it has.
+
+    Raises InvalidArgument where the training has other intensities.
+    """
+    if config.intensity != "sigmoid":
+        raise InvalidArgument("intensity must be sigmoid where a training begins with a scene", field="intensity")
+    scene = as_sigmoid(start.at_rest())
+    splats = {name: scene.splats[name].detach().cpu().float().clone() for name in PARAMETERS}
+    shift = (np.asarray(scene.info.centre_mm) - centre_mm) / 10.0
+    splats["means"] += torch.from_numpy(shift).float()
+    harmonics = torch.zeros(expected_shapes(len(scene.means), config.sh_degree)["shN"])
+    same = min(harmonics.shape[1], splats["shN"].shape[1])
+    harmonics[:, :same] = splats["shN"][:, :same]
+    return {**splats, "shN": harmonics}
+
+
+def with_labels_of(start: GaussianScene, scene: GaussianScene, sweep: Sweep) -> GaussianScene:
+    """A trained scene with the labels of its start, each Gaussian that of the nearest there.
+
+    What was made and no frame of the sweep shows keeps a label of its own among `made_labels`.
+    """
+    provenance = {
+        "parents": {"start": sha256(start.to_bytes()).hexdigest()},
+        "edits": start.info.provenance.get("edits", []),
+    }
+    if start.labels is None:
+        return replace(scene, info=replace(scene.info, provenance=provenance))
+    places = means_mm(scene).astype(np.float32)
+    index = cv2.flann.Index(means_mm(start).astype(np.float32), {"algorithm": 4, "leaf_max_size": 16})
+    nearest, _ = index.knnSearch(places, 1, params={"checks": -1})
+    labels = start.labels.cpu().numpy()[nearest[:, 0]]
+    made = start.info.made_labels
+    names = {
+        label: f"{name} (not recorded)" if label in made else name for label, name in start.info.label_names.items()
+    }
+    is_shown = shown_by(sweep, places.astype(np.float64))
+    recorded = labels.copy()
+    for label in made:
+        own = (labels == label) & is_shown
+        if own.any():
+            number = label_number(names, start.info.label_names[label])
+            names[number], recorded[own] = start.info.label_names[label], number
+    info = replace(scene.info, label_names=names, provenance={**provenance, "made": list(made)})
+    return replace(scene, labels=torch.from_numpy(recorded), info=info)
+
+
+def shown_by(sweep: Sweep, places: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]
+    """The places that lie in the image of a frame, or nearly."""
+    found = np.zeros(len(places), bool)
+    for pose in sweep.poses:
+        local = (places - pose[:3, 3]) @ pose[:3, :3]
+        near = np.flatnonzero(np.abs(local[:, 1]) < SHOWN_MM)
+        rows, columns = sweep.probe.image_coordinates(local[near, 0], local[near, 2])
+        found[near[(rows >= 0.0) & (rows <= 1.0) & (columns >= 0.0) & (columns <= 1.0)]] = True
+    return found
