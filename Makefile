@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing from-labels confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -225,6 +225,12 @@ editing: $(VENV)/installed-dev  ## what edits of scenes do to frames: 500 random
 	$(BIN)/python benchmarks/editing.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show editing
 	$(KEEP) editing
+
+from-labels: $(VENV)/installed-dev  ## scenes from labels against theory and the phantoms' simulations, and a detector trained on them; some minutes
+	$(READY)
+	$(BIN)/python benchmarks/from_labels.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show from_labels
+	$(KEEP) from_labels
 
 confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, scene by scene; takes an hour
 	$(READY)

@@ -26,6 +26,7 @@ import ablations
 import compressed
 import confidence
 import editing
+import from_labels
 import hand
 import live
 import localization
@@ -61,6 +62,7 @@ TARGETS = {
     },
     "compressed": "compressed",
     "editing": "editing",
+    "from_labels": "from-labels",
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
@@ -391,6 +393,7 @@ BLOCKS = {
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "compressed": Block("compressed", compressed.kept),
     "editing": Block("editing", editing.told),
+    "from_labels": Block("from_labels", from_labels.told),
     "localization": Block("localization", localization.found_frames),
     "frames in motion": Block("localization", localization.frames_in_motion, localization.of_motion),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),

@@ -44,9 +44,11 @@ from ultragray.learn.evaluation.baselines import compound
 from ultragray.learn.registration import register_frames
 from ultragray.learn.training.agreement import agreed_path
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
+from ultragray.phantom.abdomen import ABDOMEN, ABDOMEN_PROBE
 from ultragray.phantom.demo import DEMO_FILE
+from ultragray.phantom.recipes import make_abdomen
 from ultragray.rendering.display import Display
-from ultragray.rendering.frames import show
+from ultragray.rendering.frames import render_shown, show
 from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact, Encoding, FrameSettings, Speckle
 from ultragray.rendering.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
@@ -82,6 +84,7 @@ def main() -> None:
     draw_speckle(scene, IMAGES / "speckle.png")
     draw_tools(scene, IMAGES / "tools.png")
     draw_editing(scene, IMAGES / "editing.png")
+    draw_abdomen(IMAGES / "abdomen.png")
     draw_cases(scene, IMAGES / "cases.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
@@ -276,6 +279,28 @@ def draw_editing(scene: GaussianScene, path: Path) -> None:
         panels[place].set_title(title, fontsize=8)
         labels = np.where(supported(frames["coverage"][0].numpy()), frames["labels"][0].numpy(), 0)
         draw_labels(panels[place + len(edited)], labels, one.info.label_names)
+    save(figure, path)
+
+
+def draw_abdomen(path: Path) -> None:
+    """The second phantom as its simulation, the scene made from its labels, and the labels, at two places."""
+    scene, size = make_abdomen(), {"height": 400, "width": 320}
+    poses = np.stack([along_spine(y_mm) for y_mm in (-12.0, 16.0)])
+    asked = FrameSettings(**size, speckle=Speckle.NATURAL, outputs=("bmode", "labels"))
+    frames = render_shown(scene, asked.resolved(scene.info, Encoding.FLOAT32), poses)
+    simulated = simulate(poses, probe=ABDOMEN_PROBE, **size, phantom=ABDOMEN)
+    figure, panels = panel_row(rows=2, columns=3)
+    extent = (-40.0, 40.0, 100.0, 0.0)
+    for place in range(2):
+        pictures = simulated[place] / 255.0, frames["bmode"][place].numpy(), frames["labels"][place].numpy()
+        for column, (picture, caption) in enumerate(
+            zip(pictures, ("simulation", "made from labels", "labels"), strict=True)
+        ):
+            panel = panels[3 * place + column]
+            colours = "tab20" if caption == "labels" else "gray"
+            panel.imshow(picture, cmap=colours, vmin=0, vmax=19 if caption == "labels" else 1.0, extent=extent)
+            if place == 0:
+                panel.set_title(caption, fontsize=8)
     save(figure, path)
 
 

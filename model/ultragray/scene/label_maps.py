@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -116,7 +116,7 @@ def _read_nrrd(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
     voxels = body if encoding == "raw" else zlib.decompressobj(_ZLIB_OR_GZIP).decompress(body, expected)
     if len(voxels) < expected:
         raise ValueError(f"truncated: it holds {len(voxels)} of {expected} bytes")
-    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
+    order: Literal["<", ">"] = ">" if fields.get("endian", "little").lower() == "big" else "<"
     values = np.frombuffer(voxels[:expected], dtype.newbyteorder(order)).reshape(shape, order="F")
     vectors = re.findall(r"\(([^)]*)\)", f"{fields['space directions']} {fields['space origin']}")
     affine = np.eye(4)

@@ -10,16 +10,20 @@ the sweep show what physics says, and from elsewhere shadows fall as the beam th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import BoolArray, FloatArray, Probe
 from ultragray.learn.sweep import spread_places
 from ultragray.learn.synthesis.space import BodySpace
 from ultragray.scene.recipes import SceneRecipe
+
+Float32Array: TypeAlias = npt.NDArray[np.float32]
 
 POSES, LINES, STEP_MM = 80, 96, 0.5  # of the sweep that are followed at most, lines of each, and a step along them
 CELL_MM = 1.0  # of the grid on which losses are known
@@ -66,8 +70,9 @@ class Losses:
     def high_mm(self) -> FloatArray:
         return self.low_mm + CELL_MM * (np.array(self.seen.shape) - 1)
 
-    def shows(self, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [N] bool
-        return self._at(points, self.seen) > 1e-6
+    def shows(self, points: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]
+        shown: BoolArray = self._at(points, self.seen) > 1e-6
+        return shown
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm -> [N], [N]
         """Decibels lost, and −log T."""
@@ -77,7 +82,7 @@ class Losses:
         return interpolated(field, (points - self.low_mm) / CELL_MM)
 
 
-def interpolated(field: FloatArray, places: FloatArray) -> FloatArray:  # [I, J, K], [N, 3] in cells -> [N]
+def interpolated(field: npt.NDArray[Any], places: FloatArray) -> FloatArray:  # [I, J, K], [N, 3] in cells -> [N]
     """The value between the middles of cells; beyond the border that of the border."""
     last = np.array(field.shape) - 1
     places = np.clip(places, 0.0, last)
@@ -135,14 +140,14 @@ def _along_lines(probe: Probe, pose: FloatArray) -> FloatArray:  # [4, 4] mm -> 
     return points
 
 
-def blurred(field: FloatArray, sigma: float) -> FloatArray:  # [I, J, K] float32, cells
+def blurred(field: Float32Array, sigma: float) -> Float32Array:  # [I, J, K], in cells
     """Under a Gaussian along each axis."""
     reach = max(1, int(np.ceil(3.0 * sigma)))
     kernel = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma)).astype(np.float32)
     kernel /= kernel.sum()
     for axis in range(3):
-        rows = np.moveaxis(field, axis, 0)
+        rows: Any = np.moveaxis(field, axis, 0)
         flat = np.ascontiguousarray(rows).reshape(rows.shape[0], -1)
         smooth = cv2.sepFilter2D(flat, -1, np.ones(1, np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
-        field = np.moveaxis(smooth.reshape(rows.shape), 0, axis)
+        field = np.moveaxis(np.asarray(smooth, np.float32).reshape(rows.shape), 0, axis)
     return np.ascontiguousarray(field)

@@ -188,7 +188,8 @@ class _Builder:
         def distance(points: FloatArray) -> FloatArray:  # of a plane that is blurred so; mm, negative inside
             inside = interpolated(share, (points - self._lost.low_mm) / self._voxel_mm)
             found = torch.special.ndtri(torch.from_numpy(inside).double().clamp(1e-6, 1.0 - 1e-6))
-            return -self._blur_mm * found.numpy()
+            away: FloatArray = -self._blur_mm * found.numpy()
+            return away
 
         middles, sides = self._cubes.middles[own], self._cubes.sides[own]
         finest = sides < 1.5 * self._cubes.spacing_mm
