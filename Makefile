@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing from-labels confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing motion from-labels confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -231,6 +231,11 @@ from-labels: $(VENV)/installed-dev  ## scenes from labels against theory and the
 	$(BIN)/python benchmarks/from_labels.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show from_labels
 	$(KEEP) from_labels
+
+motion: $(VENV)/installed-dev  ## what is learned of tissue that breathes, and what a frame of it costs; trains first, ten minutes
+	$(READY)
+	$(BIN)/python benchmarks/motion.py $(DATA) $(ARGS)
+	$(KEEP) motion
 
 confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, scene by scene; takes an hour
 	$(READY)

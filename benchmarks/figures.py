@@ -32,6 +32,7 @@ import live
 import localization
 import measuring
 import methods_tables
+import motion
 import planning
 import poses
 import prediction
@@ -62,6 +63,7 @@ TARGETS = {
     },
     "compressed": "compressed",
     "editing": "editing",
+    "motion": "motion",
     "from_labels": "from-labels",
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
@@ -393,6 +395,7 @@ BLOCKS = {
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "compressed": Block("compressed", compressed.kept),
     "editing": Block("editing", editing.told),
+    "motion": Block("motion", motion.told),
     "from_labels": Block("from_labels", from_labels.told),
     "localization": Block("localization", localization.found_frames),
     "frames in motion": Block("localization", localization.frames_in_motion, localization.of_motion),

@@ -41,6 +41,7 @@ from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import LinearProbe
 from ultragray.learn.editing.editor import edit_scene
 from ultragray.learn.evaluation.baselines import compound
+from ultragray.learn.motion import chest_motion, with_motion
 from ultragray.learn.registration import register_frames
 from ultragray.learn.training.agreement import agreed_path
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
@@ -85,6 +86,7 @@ def main() -> None:
     draw_tools(scene, IMAGES / "tools.png")
     draw_editing(scene, IMAGES / "editing.png")
     draw_abdomen(IMAGES / "abdomen.png")
+    draw_motion(scene, IMAGES / "motion.png")
     draw_cases(scene, IMAGES / "cases.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
@@ -301,6 +303,18 @@ def draw_abdomen(path: Path) -> None:
             panel.imshow(picture, cmap=colours, vmin=0, vmax=19 if caption == "labels" else 1.0, extent=extent)
             if place == 0:
                 panel.set_title(caption, fontsize=8)
+    save(figure, path)
+
+
+def draw_motion(scene: GaussianScene, path: Path) -> None:
+    """The built-in chest: deep tissue goes from the skin as it breathes."""
+    moving = with_motion(scene, *chest_motion(scene.info, 8.0))
+    figure, panels = panel_row(rows=1, columns=3)
+    phases = {"at rest": 0.0, "half a breath": 0.5, "full breath": 1.0}
+    for panel, (title, number) in zip(panels, phases.items(), strict=True):
+        frame = render(moving.at_phase((number,)), None, np.eye(4), height=SIDE, width=SIDE, outputs=("bmode",)).bmode
+        panel.imshow(frame[0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panel.set_title(title, fontsize=8)
     save(figure, path)
 
 

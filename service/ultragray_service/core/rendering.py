@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
-from typing import Generic
+from typing import Generic, cast
 
 import numpy as np
 
@@ -220,10 +220,9 @@ class Rendering:
             raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
         turn = turn or Turn()
         for _ in range(MAX_SCENE_CHANGES):
-            wanted = settings or plan.settings
             request = RenderRequest(
                 plan.scene,
-                wanted.breathed(plan.header.info.motion) if isinstance(wanted, Resolved) else wanted,
+                _breathed(settings or plan.settings, plan),
                 poses,
                 priority,
                 deadline,
@@ -287,6 +286,11 @@ class Rendering:
             render_ms=sum(piece.render_ms for piece in pieces),
             encode_ms=1000 * (time.monotonic() - began),
         )
+
+
+def _breathed(settings: S, plan: Plan[S]) -> S:
+    """With the phase of this moment, where tissue breathes by the clock."""
+    return cast(S, settings.breathed(plan.header.info.motion)) if isinstance(settings, Resolved) else settings
 
 
 def _png_of(view: SliceView, data: bytes) -> bytes:

@@ -12,6 +12,7 @@ from ultragray.datasets.source import load_dataset
 from ultragray.geometry.registration import load_registration
 from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import png_file
+from ultragray.scene.info import read_header
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
@@ -49,6 +50,21 @@ def test_a_compressed_scene_is_a_scene_file_itself(make_file, tmp_path):
     assert json.loads(run("show", small, "--json").stdout)["gaussian_count"] == 60
     assert run("render", small, "-o", tmp_path / "frames.npz").exit_code == 0
     assert run("export", small, "-o", tmp_path / "a.ply").exit_code == 0
+
+
+def test_a_scene_is_given_a_mode_of_motion_and_rendered_at_a_phase(make_file, tmp_path):
+    moving = tmp_path / "moving.ugr"
+    result = run("motion", make_file(), "-o", moving, "--chest-mm", "8")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "breathing between 0 and 1, at rest at 0" in result.stdout
+    assert read_header(moving).info.motion.modes[0].name == "breathing"
+    frames = []
+    for phase in ("0", "1"):
+        made = run("render", moving, "-o", tmp_path / f"{phase}.npz", "--phase", phase)
+        assert (made.exit_code, made.stderr) == (0, "")
+        frames.append(np.load(tmp_path / f"{phase}.npz")["bmode"])
+    assert not np.array_equal(*frames)
+    assert "either --sweep and --surrogate" in refused("motion", moving, "-o", tmp_path / "none.ugr")
 
 
 def test_a_checkpoint_and_back_by_the_documented_commands(make_file, tmp_path):

@@ -1,0 +1,59 @@
+"""Modes of motion that are learned, or built in."""
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene, LinearProbe, render
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.learn.motion import chest_motion, fit_motion, read_numbers, with_motion
+from ultragray.learn.sweep import Sweep
+from ultragray.scene.info import SceneInfo
+
+PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+
+
+@pytest.fixture
+def phantom(random_scene):
+    still = random_scene(400, seed=4, extent_cm=(3.0, 1.0, 4.0), centre_cm=(0.0, 0.0, 2.0), sigma_cm=(0.08, 0.2))
+    return GaussianScene.from_splats(still.splats, info=SceneInfo(probe=PROBE))
+
+
+def test_a_shift_is_learned_from_frames_with_a_number_each(phantom):
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 1, 3] = np.linspace(-2.0, 2.0, 12)
+    numbers = np.tile([10.0, 11.0, 12.0], 4)
+    seen = poses.copy()
+    seen[:, 2, 3] -= 1.5 * (numbers - 11.0)  # tissue goes 1.5 mm deeper for each unit
+    frames = render(phantom, PROBE, seen, height=40, width=30).bmode
+    sweep = Sweep((255.0 * frames).byte().numpy(), poses, PROBE, np.arange(12), "phantom")
+    torch.manual_seed(0)
+    moving = fit_motion(phantom, sweep, numbers, surrogate="belt", steps=80, spacing_mm=20.0)
+    (mode,) = moving.info.motion.modes
+    assert (mode.low, mode.high, mode.rest, mode.surrogate) == (10.0, 12.0, 11.0, "belt")
+    middle = torch.tensor([[0.0, 0.0, 20.0]])
+    shift = moving.at_phase((12.0,)).displacements[0].at(middle)[0][0] - torch.tensor([0.0, 0.0, 1.5])
+    assert shift[[0, 2]].abs().max() < 0.4, shift
+    with pytest.raises(InvalidArgument, match="and differ"):
+        fit_motion(phantom, sweep, np.ones(12))
+
+
+def test_a_built_in_chest_moves_deep_tissue_and_leaves_the_skin(phantom):
+    moving = with_motion(phantom, *chest_motion(phantom.info, 8.0))
+    low, high = phantom.info.bounds_min_mm[2], phantom.info.bounds_max_mm[2]
+    points = torch.tensor([[0.0, 0.0, low], [0.0, 0.0, high]])
+    moved, _ = moving.at_phase((1.0,)).displacements[0].at(points)
+    assert moved[0, 2] < 0.5
+    assert 7.5 < moved[1, 2] < 8.1
+    assert not moved[:, :2].any()
+
+
+def test_numbers_that_are_none_or_too_few_are_refused(tmp_path):
+    path = tmp_path / "belt.csv"
+    path.write_text("1.0\n2.0\n3.0\n")
+    assert read_numbers(path, 3).tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(DatasetInvalid, match="each of 4 frames, got \\[3\\]"):
+        read_numbers(path, 4)
+    path.write_text("1.0\nbreath\n")
+    with pytest.raises(DatasetInvalid, match=r"belt\.csv"):
+        read_numbers(path, 2)
