@@ -33,7 +33,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing motion from-labels confidence speckle prediction preview planning live environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing motion from-labels confidence speckle prediction preview planning pressing live environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -266,6 +266,12 @@ planning: $(VENV)/installed-dev  ## half the frames, planned, against an even ra
 	$(BIN)/python benchmarks/planning.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show planning
 	$(KEEP) planning
+
+pressing: $(VENV)/installed-dev  ## how tissue gives way to a face beside finite elements of layers, and what it costs; takes a minute
+	$(READY)
+	$(BIN)/python benchmarks/pressing.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show pressing
+	$(KEEP) pressing
 
 speckle: $(VENV)/installed-dev  ## how true natural speckle is, scene by scene, and what it costs; trains first, half an hour
 	$(READY)

@@ -36,6 +36,7 @@ import motion
 import planning
 import poses
 import prediction
+import pressing
 import preview
 import results_tables
 import speckle
@@ -58,7 +59,7 @@ TARGETS = {
         name: name
         for name in (
             *("ablations", "poses", "hand", "localization", "confidence"),
-            *("speckle", "environment", "prediction", "preview", "live", "planning", "ros"),
+            *("speckle", "environment", "prediction", "preview", "live", "planning", "pressing", "ros"),
         )
     },
     "compressed": "compressed",
@@ -384,6 +385,8 @@ BLOCKS = {
     "environment": Block("environment", environment),
     "foretold poses": Block("prediction", prediction.foretold_poses),
     "previewed frames": Block("preview", preview.previewed_frames),
+    "displacement under a face": Block("pressing", pressing.displacements),
+    "cost of pressing": Block("pressing", pressing.cost_of_pressing),
     "planned views": Block("planning", planning.planned_and_even),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),

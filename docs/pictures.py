@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import matplotlib as mpl
 import numpy as np
+import torch
 import numpy.typing as npt
 
 mpl.use("Agg")
@@ -69,6 +70,7 @@ Floats = npt.NDArray[np.float64]
 SIDE = 256
 EXTENT_MM = (-30.0, 30.0, 60.0, 0.0)  # of the demo scene's probe: left, right, bottom, top
 OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between them
+PRESSED_MM = 6.0
 MOST_AGENT_STEPS = 1000
 _TO_PAPER = np.array([[1.0, 0.55, 0.0], [0.0, -0.4, 1.0]])  # cabinet projection: x to the right, z down, y away
 LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0", "tool": "#ffffff"}
@@ -82,6 +84,7 @@ def main() -> None:
     draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
     draw_augmentation(scene, IMAGES / "augmentation.png")
     draw_contact(scene, IMAGES / "contact.png")
+    draw_pressing(scene, IMAGES / "pressing.png")
     draw_speckle(scene, IMAGES / "speckle.png")
     draw_tools(scene, IMAGES / "tools.png")
     draw_editing(scene, IMAGES / "editing.png")
@@ -214,6 +217,30 @@ def draw_contact(scene: GaussianScene, path: Path) -> None:
             panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
             told = caption if frames.touch is None else f"contact {frames.touch.shares[column]:.0%}"
             panel.set_title(told, fontsize=8)
+    save(figure, path)
+
+
+def draw_pressing(scene: GaussianScene, path: Path) -> None:
+    """A frame on the skin and one pressed in, over a grid that lies in the tissue."""
+    poses = np.stack([along_spine(OVER_CANAL_MM)] * 2)
+    poses[1, 2, 3] += PRESSED_MM
+    frames = render(scene, None, poses, height=SIDE, width=SIDE, outputs=("bmode",), contact=Contact.PRESSURE)
+    assert frames.pressing is not None
+    assert frames.pressing.displacement is not None
+    x, z = np.linspace(-28.0, 28.0, 113), np.arange(5.0, 60.0, 5.0)
+    rows = np.stack(np.broadcast_arrays(x, 0.0, z[:, None]), axis=-1)
+    columns = np.stack(np.broadcast_arrays(np.arange(-25.0, 26.0, 5.0)[:, None], 0.0, np.linspace(0.0, 60.0, 121)), axis=-1)
+    figure, panels = panel_row(rows=1, columns=2)
+    for number, panel in enumerate(panels):
+        panel.imshow(frames["bmode"][number].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panel.set_autoscale_on(False)
+        for line in (*rows, *columns):  # in the image plane of the first pose, which is that of the second
+            in_scene = torch.from_numpy(line @ poses[0, :3, :3].T + poses[0, :3, 3])
+            moved = in_scene + frames.pressing.displacement.at(in_scene, number)[0]
+            seen = (moved.numpy() - poses[number, :3, 3]) @ poses[number, :3, :3]
+            panel.plot(seen[:, 0], seen[:, 2], color="tab:cyan", linewidth=0.4, alpha=0.7)
+        depth, force = frames.pressing.indentation_mm[number], frames.pressing.force_n[number]
+        panel.set_title(f"pressed in by {depth:.1f} mm, {force:.1f} N", fontsize=8)
     save(figure, path)
 
 

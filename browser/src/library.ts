@@ -55,6 +55,7 @@ export interface Plan {
   height: number;
   width: number;
   planes: boolean[];
+  displaced: boolean; // tissue, which the library alone draws
 }
 
 /** Some scan lines of the planes of a pose, from `first` to before `end`, and how many numbers that are. */
@@ -66,8 +67,8 @@ export interface Lines {
 
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
 const POSE_BYTES = 128;
-const FIGURES = 5; // of ultragray_extrapolation, a double each
-const PLAN_NUMBERS = 29;
+const FIGURES = 7; // of ultragray_extrapolation, a double each
+const PLAN_NUMBERS = 30;
 
 /** One instance of the module, with a memory of its own. Whatever is wrong with an input is an Error, in a sentence. */
 export class Library {
@@ -143,7 +144,8 @@ export class Library {
       const beam = next(4);
       const [fanned, wrap] = next(2).map(Boolean) as [boolean, boolean];
       const [height, width] = next(2) as [number, number];
-      return { axes, origin, near, row, most, start, pitch: span / width, beam, fanned, wrap, height, width, planes: numbers.map(Boolean) };
+      const planes = next(4).map(Boolean);
+      return { axes, origin, near, row, most, start, pitch: span / width, beam, fanned, wrap, height, width, planes, displaced: numbers[0] !== 0 };
     });
   }
 

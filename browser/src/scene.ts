@@ -16,7 +16,7 @@ export type Output = string;
 
 /** How far a frame extrapolates from what its scene was trained on, and how much to trust it; null: not known. */
 export type Extrapolation = Schemas["Extrapolation"];
-const FIGURES = ["distance_mm", "angle_deg", "confidence", "supported_share", "contact_share"] as const; // as the library has them
+const FIGURES = ["distance_mm", "angle_deg", "confidence", "supported_share", "contact_share", "indentation_mm", "force_n"] as const; // as the library has them
 
 /** Where the pixels of a picture lie in the image plane; see Picture of the HTTP reference. */
 export type Picture = Schemas["Picture"];

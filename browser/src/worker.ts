@@ -55,7 +55,8 @@ function prepare(view: number, settings: string): string {
 async function render(view: number, pose: readonly number[]): Promise<Drawn> {
   const at = views.get(view)!;
   try {
-    if (gpu !== undefined) return { ...(await gpu.render(view, library.plan(at, pose), (planes) => library.finish(at, pose, planes))), renderer: "webgpu", workers: 1 };
+    const plan = gpu && library.plan(at, pose);
+    if (gpu !== undefined && plan !== undefined && !plan.displaced) return { ...(await gpu.render(view, plan, (planes) => library.finish(at, pose, planes))), renderer: "webgpu", workers: 1 };
   } catch {
     if (gpu?.isLost) gpu = undefined;
   }

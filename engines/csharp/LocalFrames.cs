@@ -180,7 +180,7 @@ namespace Ultragray
         [StructLayout(LayoutKind.Sequential)]
         struct FrameExtrapolation
         {
-            double distanceMm, angleDeg, confidence, supportedShare, contactShare;
+            double distanceMm, angleDeg, confidence, supportedShare, contactShare, indentationMm, forceN;
 
             internal void CopyTo(Extrapolation it)
             {
@@ -189,6 +189,8 @@ namespace Ultragray
                 it.Confidence = Known(confidence);
                 it.SupportedShare = Known(supportedShare);
                 it.ContactShare = Known(contactShare);
+                it.IndentationMm = Known(indentationMm);
+                it.ForceN = Known(forceN);
             }
 
             static double? Known(double value) => double.IsNaN(value) ? null : (double?)value;

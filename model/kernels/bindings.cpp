@@ -7,14 +7,17 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <array>
 #include <optional>
 
 #include "adam.hpp"
 #include "between.hpp"
 #include "loss.hpp"
+#include "pressing.hpp"
 #include "render.hpp"
 #include "speckle.hpp"
+#include "stiffness.hpp"
 #include "views.hpp"
 
 namespace nb = nanobind;
@@ -42,6 +45,12 @@ using PairsOfMaps = nb::ndarray<const float, nb::shape<-1, 2, 3, 3>, nb::c_conti
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using FreeGrey = nb::ndarray<uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Labels = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using DoubleMatrix = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Shafts = nb::ndarray<const double, nb::shape<-1, -1, 2, 3>, nb::c_contig, nb::device::cpu>;
+using FreeFields = nb::ndarray<float, nb::ndim<5>, nb::c_contig, nb::device::cpu>;
+using FreeMaps = nb::ndarray<double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>;
+using FreeDoubles = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
@@ -344,6 +353,56 @@ NB_MODULE(_cpu, m) {
         nb::arg("along_x"), nb::arg("along_z"), nb::arg("start"), nb::arg("span"), nb::arg("near_mm"), nb::arg("length_mm"),
         nb::arg("least_mm"), nb::arg("smoothed"), nb::arg("doubtful"), nb::arg("nothing"), nb::arg("threads"),
         nb::arg("blends").noconvert(), nb::arg("weights").noconvert());
+
+    m.def("stiffness_kpa", &stiffness_kpa, nb::arg("label"));
+
+    nb::class_<Press>(m, "Press")
+        .def(
+            "__init__",
+            [](Press* self, Matrix means_mm, std::optional<Labels> labels, Vector compliances, double depth, double breadth,
+               bool curved, double far, double half_width, Poses poses) {
+                if (means_mm.shape(1) != 3 || (labels && labels->shape(0) != means_mm.shape(0)) ||
+                    compliances.shape(0) != 256)
+                    throw std::invalid_argument("the shapes of means, labels and compliances do not agree");
+                nb::gil_scoped_release release;
+                auto compliance = std::make_shared<const Compliance>(means_mm.data(), labels ? labels->data() : nullptr,
+                                                                     int64_t(means_mm.shape(0)), compliances.data());
+                new (self) Press(std::move(compliance), {depth, breadth, curved, far, half_width}, poses.data(),
+                                 int(poses.shape(0)));
+            },
+            nb::arg("means_mm").noconvert(), nb::arg("labels").noconvert().none(), nb::arg("compliances").noconvert(),
+            nb::arg("depth"), nb::arg("breadth"), nb::arg("curved"), nb::arg("far"), nb::arg("half_width"),
+            nb::arg("poses").noconvert())
+        .def_prop_ro("size", &Press::size)
+        .def(
+            "at",
+            [](const Press& self, Poses poses, DoubleMatrix indentation_mm, Shafts needles_mm, FreeFields coefficients,
+               FreeMaps to_grid, FreeDoubles force_n) {
+                const size_t count = poses.shape(0);
+                if (indentation_mm.shape(0) != count || indentation_mm.shape(1) == 0 || needles_mm.shape(0) != count ||
+                    coefficients.shape(0) != count || to_grid.shape(0) != count || force_n.shape(0) != count)
+                    throw std::invalid_argument("there must be as many of all as poses");
+                const std::array<int, 3> size = self.size();
+                for (int d = 0; d < 3; ++d)
+                    if (coefficients.shape(1 + d) != size_t(size[d]))
+                        throw std::invalid_argument("the field's size is not that of the press");
+                nb::gil_scoped_release release;
+                for (size_t c = 0; c < count; ++c) {
+                    std::vector<Shaft> needles(needles_mm.shape(1));
+                    static_assert(sizeof(Shaft) == 6 * sizeof(double), "two points, nothing between");
+                    std::copy_n(needles_mm.data() + 6 * needles.size() * c, 6 * needles.size(),
+                                reinterpret_cast<double*>(needles.data()));
+                    const Pressed pressed =
+                        self.at(poses.data() + 16 * c, indentation_mm.data() + indentation_mm.shape(1) * c,
+                                int(indentation_mm.shape(1)), needles);
+                    std::copy(pressed.coefficients.begin(), pressed.coefficients.end(),
+                              coefficients.data() + pressed.coefficients.size() * c);
+                    std::copy(pressed.to_grid.begin(), pressed.to_grid.end(), to_grid.data() + 12 * c);
+                    force_n.data()[c] = pressed.force_n;
+                }
+            },
+            nb::arg("poses").noconvert(), nb::arg("indentation_mm").noconvert(), nb::arg("needles_mm").noconvert(),
+            nb::arg("coefficients").noconvert(), nb::arg("to_grid").noconvert(), nb::arg("force_n").noconvert());
 
     m.def(
         "add_speckle",

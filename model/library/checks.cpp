@@ -66,6 +66,7 @@ void check(const RenderSettings& it, const Value& value) {
     for (const auto& [name, given] : {std::pair("phase", it.phase && !it.phase->empty()), {"breathing", bool(it.breathing)}})
         if (given) value.fail(name, "must not be given: frames without a service show tissue at rest");
     if (it.outputs.empty()) value.fail("outputs", "must name at least one");
+    if (it.indentation_mm && it.contact != Contact::Pressure) value.fail("indentation_mm", "needs contact pressure");
 }
 
 }  // namespace ultragray::library

@@ -151,7 +151,7 @@ double ConfidenceModel::limited(double confidence, double supported_share) const
 }
 
 Extrapolation assess(const TrainingViews* views, const ConfidenceModel* model, const Pose& pose, const Probing& probe) {
-    Extrapolation found{kNaN, kNaN, kNaN, kNaN, kNaN};
+    Extrapolation found{kNaN, kNaN, kNaN, kNaN, kNaN, kNaN, kNaN};
     if (views == nullptr) return found;
     const ViewMeasures measures = views->measure(pose, probe, kPointsPerSide);
     found.distance_mm = mean_of(measures.nearest_mm);

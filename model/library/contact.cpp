@@ -8,7 +8,7 @@ namespace {
 
 constexpr double kCouplingMm = 1.0, kMarginMm = 15.0, kLeastSlope = 0.2, kLeastAgreement = 0.6, kLeastCellMm = 1.0;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr double kAlongTheSkin = 1e-6, kMetMm = 1e-3, kMostCompression = 0.5;
+constexpr double kAlongTheSkin = 1e-6, kMetMm = 1e-3;
 constexpr int kMostCells = 256, kMostViews = 4096, kSettled = 8, kSteps = 6, kBlurred = 2;
 // Of a way over a cell and over two, as on a chessboard's rook, bishop and knight: what OpenCV takes for distances that
 // have labels, with 16 bits after the point.
@@ -182,7 +182,7 @@ std::vector<double> Skin::pressed_mm(const std::vector<Vector>& points, const st
     return pressed;
 }
 
-Touch::Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width) : lines(width) {
+Touch::Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width) : lines(width), depths_mm(width) {
     std::vector<Vector> faces, directions;
     for (int j = 0; j < width; ++j) {
         Vector origin, direction;
@@ -191,28 +191,11 @@ Touch::Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width
         directions.push_back(pose.turned(direction));
     }
     const std::vector<double> gaps = skin.gaps_mm(faces, directions), pressed = skin.pressed_mm(faces, directions);
-    double sum = 0;
-    int count = 0;
     for (int j = 0; j < width; ++j) {
         lines[j] = gaps[j] <= kCouplingMm;
-        count += lines[j];
-        sum += lines[j] ? pressed[j] : 0.0;
+        depths_mm[j] = lines[j] ? pressed[j] : 0.0;
     }
-    share = double(count) / width;
-    pressed_mm = sum / std::max(count, 1);
-}
-
-// Of a scan line of length L from the face, pressed in by d, the sample at depth z shows the tissue that lay at z - d (1 -
-// z/L) before: this is what a probe sees that is d farther out along its middle scan line and whose lines are longer by d.
-Probing at_rest(const Probing& probe, double pressed_mm, Vector& motion_mm) {
-    const double face = probe.face_mm, depth = probe.far_mm - face;
-    const double pressed = std::min(pressed_mm, kMostCompression * depth), stretch = 1.0 + pressed / depth;
-    Probing longer = probe.ending_at(face + stretch * depth);
-    if (probe.near_mm != face) longer.near_mm = face + stretch * (probe.near_mm - face);
-    Vector origin, direction;
-    probe.ray(probe.across(0, 1), origin, direction);
-    motion_mm = times(direction, -pressed);
-    return longer;
+    count = int(std::count(lines.begin(), lines.end(), true));
 }
 
 }  // namespace ultragray::library

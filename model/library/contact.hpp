@@ -1,4 +1,4 @@
-// Contact of a probe with the skin under a scene's training views, and tissue under pressure (ultragray.rendering.contact).
+// Contact of a probe with the skin under a scene's training views (ultragray.rendering.contact).
 #pragma once
 
 #include "geometry.hpp"
@@ -35,12 +35,9 @@ class Skin {
 struct Touch {
     Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width);
 
-    std::vector<bool> lines;  // [W]: those that have contact
-    double share;             // of them
-    double pressed_mm;        // how far the face lies beyond the innermost training face, a mean over these
+    std::vector<bool> lines;        // [W]: those that have contact
+    std::vector<double> depths_mm;  // [W]: how far the face lies beyond the innermost training face; 0 for the others
+    int count;                      // of those that have contact
 };
-
-// The probe, and in `motion_mm` the way to it in its own frame, that sees tissue at rest as this one sees it pressed.
-Probing at_rest(const Probing& probe, double pressed_mm, Vector& motion_mm);
 
 }  // namespace ultragray::library

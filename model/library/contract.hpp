@@ -279,6 +279,7 @@ struct RenderSettings {
     Below below_min_confidence = Below::Refuse;
     std::optional<double> slice_thickness_mm;
     std::optional<Contact> contact;
+    std::optional<double> indentation_mm;
     std::optional<std::vector<Tool>> tools;
     std::optional<double> ghost;
     std::optional<std::vector<double>> phase;
@@ -296,6 +297,7 @@ struct RenderSettings {
         fields.read("below_min_confidence", [&](const Value& value) { below_min_confidence = read_Below(value); });
         fields.read("slice_thickness_mm", [&](const Value& value) { slice_thickness_mm = value.number({0.0, 100.0, {}}); });
         fields.read("contact", [&](const Value& value) { contact = read_Contact(value); });
+        fields.read("indentation_mm", [&](const Value& value) { indentation_mm = value.number({0.0, 50.0, {}}); });
         fields.read("tools", [&](const Value& value) { tools = read_list<Tool>(value, 8, [](const Value& value) { return read_Tool(value); }); });
         fields.read("ghost", [&](const Value& value) { ghost = value.number({0.0, 1.0, {}}); });
         fields.read("phase", [&](const Value& value) { phase = value.numbers({}, 8); });

@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "../kernels/render.hpp"
+#include "../kernels/stiffness.hpp"
 
 namespace ultragray::library {
 namespace {
@@ -147,9 +148,30 @@ LoadedScene::LoadedScene(Scene read) : scene(std::move(read)) {
 }
 
 const Skin& LoadedScene::skin() const {
-    const std::lock_guard<std::mutex> guard(skin_lock_);
+    const std::lock_guard<std::mutex> guard(lock_);
     if (!skin_) skin_ = std::make_unique<Skin>(scene.training_poses, scene.info.probe);
     return *skin_;
+}
+
+std::shared_ptr<const Compliance> LoadedScene::compliance() const {
+    const std::lock_guard<std::mutex> guard(lock_);
+    if (compliance_) return compliance_;
+    std::vector<float> means;
+    std::vector<uint8_t> labels;
+    for (const auto& [label, part] : scene.parts) {
+        const SceneView some = part->view();
+        for (int64_t i = 0; i < some.count; ++i) {
+            for (int d = 0; d < 3; ++d)
+                means.push_back(float(10.0 * double(some.gaussians[i].mean[d]) + scene.info.centre_mm[d]));
+            labels.push_back(uint8_t(label));
+        }
+    }
+    std::array<float, 256> by_label;
+    by_label.fill(float(1.0 / stiffness_kpa("")));
+    for (const auto& [label, name] : scene.info.label_names) by_label[label] = float(1.0 / stiffness_kpa(name));
+    compliance_ = std::make_shared<const Compliance>(means.data(), means.empty() ? nullptr : labels.data(),
+                                                     int64_t(labels.size()), by_label.data());
+    return compliance_;
 }
 
 View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings)
@@ -165,6 +187,16 @@ View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings
     picture_ = display_.pixel_mm ? Picture::of_plane(shown, *display_.pixel_mm) : Picture::of_frame(shown, rows_, width_);
     if (display_.pixel_mm) samples_ = samples();
     if (settings_.contact) scene_->skin();
+    if (settings_.contact == Contact::Pressure) {
+        std::vector<double> poses;
+        for (const Pose& pose : scene_->poses_at_rest()) {
+            const std::array<double, 16> matrix = pose.matrix();
+            poses.insert(poses.end(), matrix.begin(), matrix.end());
+        }
+        const bool curved = probe_.is_angular() && probe_.face_mm > 0.0;
+        const Face face{probe_.face_mm, probe_.breadth_mm(probe_.face_mm), curved, probe_.far_mm, probe_.half_width_mm()};
+        press_ = std::make_unique<Press>(scene_->compliance(), face, poses.data(), int(poses.size() / 16));
+    }
     if (settings_.speckle == Speckle::Natural)
         speckle_ = std::make_unique<SpeckleSamples>(scene_->speckle->model(), probe_, height_, width_);
     if (display_.flip) {
@@ -217,7 +249,7 @@ void View::draw(const Sight& sight, const Lines& lines, int threads, Planes& pla
     ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
                       {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr, nullptr,
                        nullptr, nullptr, 0.0f},
-                      {}, lines);
+                      {}, lines, sight.displacements());
 }
 
 void View::draw(const double* pose, int first_line, int end_line, float* drawn) const {
@@ -250,6 +282,7 @@ ultragray_plan View::plan(const double* pose) const {
     plan.height = height_, plan.width = width_;
     plan.bmode = !planes.bmode.empty(), plan.echo = !planes.echo.empty();
     plan.transmittance = !planes.transmittance.empty(), plan.coverage = !planes.coverage.empty();
+    plan.displaced = sight.pressed.has_value();
     return plan;
 }
 
@@ -270,22 +303,46 @@ bool View::asks_for(const char* output) const {
 }
 
 Sight View::sight_of(const Pose& pose, const std::string& name) const {
+    Sight sight{name, pose, scene_->at_rest(pose), probe_.kernel(height_, beam_), {}, {}, {}};
+    if (settings_.contact) sight.touch.emplace(scene_->skin(), probe_, pose, width_);
+    if (press_) press(sight);
     const Vector& centre = scene_->scene.info.centre_mm;
-    Sight sight{name, pose, probe_, scene_->at_rest(pose), {}, {}, {}};
-    Vector motion_mm{};
-    if (settings_.contact) {
-        sight.touch.emplace(scene_->skin(), probe_, pose, width_);
-        if (settings_.contact == Contact::Pressure && sight.touch->pressed_mm > 0.0)
-            sight.probe = library::at_rest(probe_, sight.touch->pressed_mm, motion_mm);
-    }
-    // By way of the kernels' own frame, cm about the scene's centre, as Python goes it: so that nothing is rounded
-    // otherwise.
-    Pose inside = sight.at_rest;
-    inside.origin = plus(times(minus(inside.origin, centre), 1.0 / 10.0), inside.turned(times(motion_mm, 1.0 / 10.0)));
+    Pose inside = sight.at_rest;  // by way of the kernels' own frame, cm about the scene's centre, as Python goes it
+    inside.origin = times(minus(inside.origin, centre), 1.0 / 10.0);
     sight.at_rest.origin = plus(times(inside.origin, 10.0), centre);
-    sight.probe.kernel_pose(inside, sight.matrix);
-    sight.geometry = sight.probe.kernel(height_, beam_);
+    probe_.kernel_pose(inside, sight.matrix);
     return sight;
+}
+
+// How the face and needles displace the tissue (ultragray.rendering.pressing).
+void View::press(Sight& sight) const {
+    std::vector<double> depths = sight.touch->depths_mm;
+    if (settings_.indentation_mm)
+        std::fill(depths.begin(), depths.end(), sight.touch->count ? *settings_.indentation_mm : 0.0);
+    double sum = 0;
+    for (size_t j = 0; j < depths.size(); ++j) sum += sight.touch->lines[j] ? depths[j] : 0.0;
+    std::vector<Shaft> needles;
+    const ScanView seen(probe_, sight.pose, 1, beam_);
+    for (const Tool& tool : settings_.tools.value_or(std::vector<Tool>{}))
+        if (const auto* needle = std::get_if<Needle>(&tool)) {
+            const Vector tip = seen.seen(needle->frame, needle->tip_mm), hub = seen.seen(needle->frame, needle->hub_mm);
+            needles.push_back({{tip[0], tip[1], tip[2]}, {hub[0], hub[1], hub[2]}});
+        }
+    sight.indentation_mm = sum / std::max(sight.touch->count, 1), sight.force_n = 0.0;
+    if (sum == 0.0 && needles.empty()) return;
+    sight.pressed = press_->at(sight.at_rest.matrix().data(), depths.data(), width_, needles);
+    sight.force_n = sight.pressed->force_n;
+    for (float& one : sight.pressed->coefficients) one /= 10.0f;
+    for (int a = 0; a < 3; ++a) {
+        double* row = &sight.pressed->to_grid[4 * a];
+        for (int d = 0; d < 3; ++d) row[3] += row[d] * scene_->scene.info.centre_mm[d], row[d] *= 10.0;
+    }
+}
+
+Displacements Sight::displacements() const {
+    if (!pressed) return {};
+    const auto& [coefficients, size, to_grid, force] = *pressed;
+    return {{coefficients.data(), to_grid.data(), {size[0], size[1], size[2]}, false, false}};
 }
 
 // Room for the planes that the outputs follow from, and for those that tools, ghosts and confidence do.
@@ -314,14 +371,15 @@ void View::finish(const Sight& sight, Planes& drawn, int threads, Extrapolation*
     };
     leave_heard(drawn.bmode), leave_heard(drawn.transmittance);
     const double ghost = settings_.ghost.value_or(0.0);
-    if (ghost > 0.0 && !drawn.echo.empty() && !drawn.bmode.empty()) add_ghosts(drawn, sight.probe, height_, width_, ghost);
+    if (ghost > 0.0 && !drawn.echo.empty() && !drawn.bmode.empty()) add_ghosts(drawn, probe_, height_, width_, ghost);
 
     bool masked = false;
     if (judged) {
         const auto supported = std::count_if(drawn.coverage.begin(), drawn.coverage.end(),
                                              [](float coverage) { return coverage >= kSupportCoverage; });
         add_support(*judged, scene_->confidence(), float(supported) / float(drawn.coverage.size()));
-        if (sight.touch) judged->contact_share = sight.touch->share;
+        if (sight.touch) judged->contact_share = double(sight.touch->count) / width_;
+        judged->indentation_mm = sight.indentation_mm, judged->force_n = sight.force_n;
         require_confidence(sight, *judged);
         masked = settings_.below_min_confidence == Below::Mask && !is_confident(*judged, settings_.min_confidence);
     }
@@ -335,9 +393,7 @@ void View::finish(const Sight& sight, Planes& drawn, int threads, Extrapolation*
                                                                : labels(sight, threads);
         if (is_numbers(output)) tools.mark(plane);
         if (output == "bmode" && speckle_) {
-            std::optional<SpeckleSamples> pressed;
-            if (sight.probe.far_mm != probe_.far_mm) pressed.emplace(scene_->speckle->model(), sight.probe, height_, width_);
-            plane = scene_->speckle->added(plane, pressed ? *pressed : *speckle_, sight.at_rest, threads);
+            plane = scene_->speckle->added(plane, *speckle_, sight.at_rest, threads);
             leave_heard(plane);
         }
         plane.resize(size_t(rows_) * width_);
@@ -383,7 +439,7 @@ std::vector<float> View::attenuation(const std::vector<float>& transmittance) co
 }
 
 std::vector<float> View::uncertainty(const Sight& sight, const Planes& drawn) const {
-    const ViewMeasures measures = scene_->views_at_rest->measure(sight.at_rest, sight.probe, kUncertaintyPoints);
+    const ViewMeasures measures = scene_->views_at_rest->measure(sight.at_rest, probe_, kUncertaintyPoints);
     return deviations(*scene_->confidence()->uncertainty, measures, {drawn.bmode, drawn.coverage, drawn.transmittance},
                       height_, width_);
 }
@@ -394,7 +450,8 @@ std::vector<float> View::labels(const Sight& sight, int threads) const {
     std::vector<float> found(size), heaviest(size), weight(size);
     for (const auto& [label, part] : scene_->scene.parts) {
         ultragray::render(*part, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
-                          {nullptr, nullptr, nullptr, nullptr, weight.data(), nullptr, nullptr, nullptr, 0.0f}, {});
+                          {nullptr, nullptr, nullptr, nullptr, weight.data(), nullptr, nullptr, nullptr, 0.0f}, {}, {},
+                          sight.displacements());
         for (size_t k = 0; k < size; ++k)
             if (weight[k] > heaviest[k] && weight[k] >= kLeastWeightSum) heaviest[k] = weight[k], found[k] = float(label);
     }

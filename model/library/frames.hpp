@@ -4,6 +4,7 @@
 #include <memory>
 #include <mutex>
 
+#include "../kernels/pressing.hpp"
 #include "contact.hpp"
 #include "scene_file.hpp"
 #include "speckle.hpp"
@@ -22,6 +23,8 @@ class LoadedScene {
     const std::vector<Pose>& poses_at_rest() const { return tissue_ ? scene.rest_poses : scene.training_poses; }
     const ConfidenceModel* confidence() const { return scene.info.confidence ? &*scene.info.confidence : nullptr; }
 
+    std::shared_ptr<const Compliance> compliance() const;  // of the tissue, made once it is asked for
+
     const Scene scene;
     // Of training views as tracked, and of those in the tissue at rest; null where they are not known.
     std::unique_ptr<TrainingViews> views, views_at_rest;
@@ -29,8 +32,9 @@ class LoadedScene {
 
  private:
     std::unique_ptr<FollowingTissue> tissue_;  // null where it is rigid
-    mutable std::mutex skin_lock_;
+    mutable std::mutex lock_;                  // of what is made later
     mutable std::unique_ptr<Skin> skin_;
+    mutable std::shared_ptr<const Compliance> compliance_;
 };
 
 // What the pose of a frame leads to, before anything is drawn: where the probe sees the tissue at rest, as the kernels take
@@ -38,11 +42,14 @@ class LoadedScene {
 struct Sight {
     std::string name;  // of the pose, in messages
     Pose pose;         // as tracked
-    Probing probe;     // as asked for, or with longer scan lines where the tissue is pressed
-    Pose at_rest;      // of this probe
+    Pose at_rest;
     ProbeGeometry geometry;
     double matrix[16];
-    std::optional<Touch> touch;  // none: contact is assumed
+    std::optional<Touch> touch;      // none: contact is assumed
+    std::optional<Pressed> pressed;  // none: no tissue is displaced; in cm about the scene's centre
+    double indentation_mm = std::nan("");
+    double force_n = std::nan("");
+    Displacements displacements() const;
 };
 
 // Settings of frames of one scene, checked and completed, and all of them that does not depend on the pose.
@@ -70,6 +77,7 @@ class View {
         bool inside;
     };
     Sight sight_of(const Pose& pose, const std::string& name) const;
+    void press(Sight& sight) const;
     Planes wanted_planes(bool judged) const;
     void draw(const Sight& sight, const Lines& lines, int threads, Planes& planes) const;
     // From planes to pixels. What the pose alone tells of its extrapolation is completed; null: nobody wants to know.
@@ -89,11 +97,12 @@ class View {
     std::shared_ptr<const LoadedScene> scene_;
     RenderSettings settings_;
     Display display_;
-    Probing probe_;                      // as asked for
+    Probing probe_;
     std::optional<ElevationBeam> beam_;  // likewise
     int height_, width_, rows_;          // as rendered, and the rows of it that are shown
     Picture picture_;
     std::vector<Sample> samples_;
+    std::unique_ptr<Press> press_;             // null without contact pressure
     std::unique_ptr<SpeckleSamples> speckle_;  // null where none is drawn
     std::string json_;
 };

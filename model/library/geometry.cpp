@@ -74,6 +74,16 @@ Pose Pose::read(const double* matrix, const std::string& name) {
     return pose;
 }
 
+std::array<double, 16> Pose::matrix() const {
+    std::array<double, 16> rows{};
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) rows[4 * i + j] = turn[i][j];
+        rows[4 * i + 3] = origin[i];
+    }
+    rows[15] = 1.0;
+    return rows;
+}
+
 Vector Pose::turned(const Vector& v) const {
     Vector out;
     for (int i = 0; i < 3; ++i) out[i] = turn[i][0] * v[0] + turn[i][1] * v[1] + turn[i][2] * v[2];
@@ -165,6 +175,12 @@ Probing Probing::ending_at(double far) const {
 }
 
 double Probing::breadth_mm(double depth) const { return is_angular() ? depth * radians(span) : span; }
+
+double Probing::half_width_mm() const {
+    double half = 0;
+    for (const Vector& corner : corners()) half = std::max(half, std::fabs(corner[0]));
+    return half;
+}
 
 void Probing::ray(double across, Vector& origin, Vector& direction) const {
     const double angle = radians(is_angular() ? across : steering_deg);

@@ -29,6 +29,7 @@ struct Pose {
     // Of a matrix [4, 4], row by row; a rotation within 1e-3 of a proper one becomes it. `name` is the caller's. Throws
     // Fault.
     static Pose read(const double* matrix, const std::string& name);
+    std::array<double, 16> matrix() const;
     Vector turned(const Vector& v) const;
     Vector turned_back(const Vector& v) const;
     Vector at(const Vector& point) const;
@@ -60,6 +61,7 @@ struct Probing {
     double length_mm() const { return far_mm - near_mm; }
     double depth_mm(int row, int height) const { return near_mm + length_mm() * (row + 0.5) / height; }
     double breadth_mm(double depth) const;  // of a row of the image
+    double half_width_mm() const;           // of the image, where it is widest
     double across(double column, int width) const { return start() + span * ((column + 0.5) / width); }
     // The point of depth 0 of the line at a place, and its unit direction, in the probe's frame.
     void ray(double across, Vector& origin, Vector& direction) const;

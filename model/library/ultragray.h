@@ -51,6 +51,8 @@ typedef struct ultragray_extrapolation {
     double confidence;      /* the MS-SSIM that a real frame at this pose is expected to have with this one, 0 to 1 */
     double supported_share; /* of the pixels: those that Gaussians support */
     double contact_share;   /* of the scan lines: those with contact; NaN where contact is assumed */
+    double indentation_mm;  /* of the face, a mean over these; NaN without contact pressure */
+    double force_n;         /* of the face on the tissue, along its axis; NaN likewise */
 } ultragray_extrapolation;
 
 /* Frames of `count` poses [count, 4, 4] into `pixels`, count * ultragray_frame_bytes(view), on up to so many threads; and how
@@ -77,6 +79,7 @@ typedef struct ultragray_plan {
     double fanned, wrap;             /* lines run from the origin; the first one follows the last */
     double height, width;            /* of the planes */
     double bmode, echo, transmittance, coverage; /* which of them ultragray_finish wants */
+    double displaced;                /* whether tissue is, which ultragray_draw alone draws */
 } ultragray_plan;
 
 /* What the planes of a pose [4, 4] are drawn by. Returns 0, or another number where it failed. */

@@ -8,7 +8,7 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch, at_rest
+from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch
 from ultragray.rendering.outputs import PLANES
 from ultragray.rendering.settings import Contact
 
@@ -38,7 +38,7 @@ def test_frames_in_contact_are_those_of_assumed_contact(scene):
     for contact in Contact:
         judged = render(scene, None, poses, **SIZE, outputs=OUTPUTS, contact=contact)
         assert judged.touch.shares.tolist() == [1.0] * len(poses)
-        assert judged.touch.pressed_mm.tolist() == [0.0] * len(poses)
+        assert not judged.touch.depths_mm.any()
         for name in OUTPUTS:
             assert torch.equal(judged[name], assumed[name]), name
 
@@ -62,32 +62,6 @@ def test_scan_lines_in_the_air_are_dark_and_the_others_as_they_were(scene):
     assert (in_air[1:] == 0.0).all()
 
 
-@pytest.mark.parametrize(
-    "probe",
-    [PROBE, LinearProbe(30.0, 4.0, 40.0), ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)],
-    ids=str,
-)
-def test_a_sample_shows_what_lay_where_the_documentation_says(probe):
-    pressed, height = 6.0, 50
-    longer, motion = at_rest(probe, pressed)
-    length = probe.far_mm - probe.face_depth_mm
-    depth = probe.depths_mm(height) - probe.face_depth_mm
-    seen = longer.depths_mm(height) - longer.face_depth_mm + motion[2, 3]
-    np.testing.assert_allclose(seen, depth - pressed * (1.0 - depth / length), atol=1e-9)
-    np.testing.assert_allclose(motion[:3, :3], np.eye(3))
-
-
-def test_pressure_brings_tissue_nearer_and_leaves_the_far_end(scene):
-    pressed = render(scene, None, at(z=5.0), **SIZE, contact=Contact.PRESSURE)
-    assert pressed.touch.pressed_mm[0] == pytest.approx(5.0, abs=1e-2)
-    longer = LinearProbe(PROBE.width_mm, 0.0, 45.0)
-    expected = render(scene, longer, at(), **SIZE)
-    for name in PLANES:
-        torch.testing.assert_close(pressed[name], expected[name], atol=2e-3, rtol=0.0)
-    through = render(scene, None, at(z=5.0), **SIZE, contact=Contact.AIR)
-    assert (through["bmode"] - pressed["bmode"]).abs().mean() > 0.01
-
-
 def test_poses_keep_their_order_under_pressure(scene):
     poses = np.stack([at(z=3.0), at(y=4.0), at(x=3.0, z=6.0), at(z=-3.0)])
     together = render(scene, None, poses, **SIZE, contact=Contact.PRESSURE)
@@ -95,6 +69,7 @@ def test_poses_keep_their_order_under_pressure(scene):
         alone = render(scene, None, pose, **SIZE, contact=Contact.PRESSURE)
         for name in PLANES:
             assert torch.equal(together[name][place], alone[name][0])
+        assert together.pressing.force_n[place] == alone.pressing.force_n[0]
 
 
 def test_gradients_reach_the_scene_and_the_pose(scene):
@@ -143,7 +118,7 @@ def test_training_views_have_contact_and_are_not_pressed(probe):
     views[:, 2, 3] += rng.uniform(-2.0, 2.0, len(views))  # one was pressed harder than the other
     touch = Touch.of(Skin.under(views, probe), probe, views, WIDTH)
     assert touch.shares.min() > 0.95
-    assert touch.pressed_mm.max() < 0.3
+    assert touch.mean(touch.depths_mm).max() < 0.3
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=str)
@@ -215,7 +190,8 @@ def test_pressure_is_what_goes_beyond_the_innermost_face():
     views[21:, 2, 3] = 2.0  # the second pass was pressed by 2 mm
     skin = Skin.under(views, probe)
     poses = np.stack([placed(probe, y=20.0, lifted_mm=-pressed) for pressed in (0.0, 2.0, 5.0)])
-    np.testing.assert_allclose(Touch.of(skin, probe, poses, WIDTH).pressed_mm, [0.0, 0.0, 3.0], atol=1e-2)
+    touch = Touch.of(skin, probe, poses, WIDTH)
+    np.testing.assert_allclose(touch.mean(touch.depths_mm), [0.0, 0.0, 3.0], atol=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -415,13 +415,13 @@ def test_labels_of_tools_lie_over_those_of_the_tissue(scene):
 
 def test_a_tool_is_rigid_under_pressure(scene, empty_scene):
     poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[1, 2, 3], poses[2, 2, 3] = 5.0, 2.0  # pressed in: each pose is drawn alone
+    poses[1, 2, 3], poses[2, 2, 3] = 5.0, 2.0  # pressed in
     empty = replace(empty_scene, training_poses=scene.training_poses, info=replace(empty_scene.info, probe=LINEAR))
     needle = Needle(tip_mm=(5.0, 0.0, 30.0), hub_mm=(-10.0, 0.0, 12.0))
     asked = {**SIZE, "outputs": ("labels", "transmittance"), "tools": (needle,)}
     expected = render(empty, None, poses, **asked)
     pressed = render(empty, None, poses, **asked, contact=Contact.PRESSURE)
-    assert pressed.touch.pressed_mm.max() > 4.0
+    assert pressed.pressing.indentation_mm.max() > 4.0
     for name in ("labels", "transmittance"):
         assert torch.equal(pressed[name], expected[name])
 

@@ -81,6 +81,10 @@ CASES = {
     "defaults": ({}, {}),
     "air": ({"contact": "air"}, {"contact": Contact.AIR}),
     "pressure": ({"contact": "pressure"}, {"contact": Contact.PRESSURE}),
+    "indentation": (
+        {"contact": "pressure", "indentation_mm": 3.0},
+        {"contact": Contact.PRESSURE, "indentation_mm": 3.0},
+    ),
     "a plane": ({"slice_thickness_mm": 0.0}, {"beam": ElevationBeam(0.0)}),
     "a thick slice": ({"slice_thickness_mm": 6.0}, {"beam": replace(BEAM, thickness_mm=6.0)}),
     "tools": ({"tools": to_dict(TOOLS)}, {"tools": TOOLS}),

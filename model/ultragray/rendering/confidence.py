@@ -5,7 +5,7 @@ Before it stands `ultragray.scene.confidence`, which needs the pose alone; `rend
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.contact import Touch
 from ultragray.rendering.settings import Below, Resolved
 from ultragray.scene.confidence import (
     SUPPORT_COVERAGE,
@@ -36,13 +35,15 @@ class SupportWatch:
         self._assessor, self._extrapolations = assessor, extrapolations
         self._noted: list[Tensor | npt.NDArray[np.float32]] = []  # each [C]: shares that a GPU may be at work on
         self._shares: list[float] = []  # those before
-        self._contacts: list[FloatArray] = []
+        self._contacts: list[Mapping[str, FloatArray]] = []
         self._count = 0
 
-    def look(self, coverage: Tensor, touch: Touch | None = None) -> Tensor | None:  # [C, H, W] -> [C, H, W]
-        """A mask of the pixels of the next C poses that are to be black; None where none are."""
-        if touch is not None:
-            self._contacts.append(touch.shares)
+    def look(self, coverage: Tensor, contact: Mapping[str, FloatArray]) -> Tensor | None:  # [C, H, W] -> [C, H, W]
+        """A mask of the pixels of the next C poses that are to be black; None where none are.
+
+        `contact`: those of CONTACT_FIGURES that were judged, [C] each.
+        """
+        self._contacts.append(contact)
         shares = supported_shares(coverage)
         self.note(shares)
         if self._mask_below is None:
@@ -64,10 +65,11 @@ class SupportWatch:
         self._shares.extend(share for some in self._noted for share in some.tolist())
         self._noted.clear()
         found = self._assessor.with_support(self._extrapolations[first:stop], self._shares[first:stop])
-        if not self._contacts:
-            return found
-        contacts = np.concatenate(self._contacts)[first:stop].tolist()
-        return [replace(one, contact_share=contact) for one, contact in zip(found, contacts, strict=True)]
+        judged = {
+            name: np.concatenate([one[name] for one in self._contacts])[first:stop].tolist()
+            for name in (self._contacts[0] if self._contacts else ())
+        }
+        return [replace(one, **{name: judged[name][at] for name in judged}) for at, one in enumerate(found)]
 
 
 def supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]

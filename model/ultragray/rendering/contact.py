@@ -1,13 +1,13 @@
-"""Contact of a probe with the skin: which scan lines have it, and how tissue gives way to pressure. Needs no torch.
+"""Contact of a probe with the skin: which scan lines have it, and how far the face is pressed in. Needs no torch.
 
-A scene's training poses tell its `Skin`, the skin and a probe at poses their `Touch`, and a touch under pressure the
-probe that sees at rest what this one sees pressed (`at_rest`). `ultragray.rendering.frames` asks for them first.
+A scene's training poses tell its `Skin`, the skin and a probe at poses their `Touch`. `ultragray.rendering.frames` asks
+for them first; what pressing does to the tissue is in `ultragray.rendering.pressing`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
@@ -180,10 +180,13 @@ class Touch:
         return self.skin.gaps_mm(self.faces, self.directions)
 
     @cached_property
-    def pressed_mm(self) -> FloatArray:  # [C]
-        """How far the face lies beyond the innermost training face, a mean over the lines with contact; at least 0."""
-        pressed = np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0).sum(axis=1)
-        mean: FloatArray = pressed / np.maximum(self.lines.sum(axis=1), 1)
+    def depths_mm(self) -> FloatArray:  # [C, W]
+        """How far the face lies beyond the innermost training face; 0 for lines without contact."""
+        return np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0)
+
+    def mean(self, depths_mm: FloatArray) -> FloatArray:  # [C, W] -> [C]
+        """Over the lines with contact; 0 where none has it."""
+        mean: FloatArray = depths_mm.sum(axis=1) / np.maximum(self.lines.sum(axis=1), 1)
         return mean
 
     @property
@@ -195,26 +198,3 @@ class Touch:
     def shares(self) -> FloatArray:  # [C]
         shares: FloatArray = self.lines.mean(axis=1)
         return shares
-
-
-# Tissue under pressure: compressed evenly between the face and the far end of the image, which stays where it was.
-#
-# Of a scan line of length L from the face, pressed in by d, the sample at depth z shows the tissue that lay at z −
-# d·(1 − z/L) before: d above the face at the face itself, the same place at the far end. This is what a probe sees
-# that is d farther out along its middle scan line and whose lines are longer by d, with as many samples.
-
-MOST_COMPRESSION = 0.5  # of the depth of the image: a face pressed in farther moves on through the tissue
-
-
-def at_rest(probe: Probe, pressed_mm: float) -> tuple[Probe, FloatArray]:  # -> [4, 4] mm
-    """The probe, and its motion in its own frame, that see tissue at rest as this one sees it pressed."""
-    face, depth = probe.face_depth_mm, probe.far_mm - probe.face_depth_mm
-    pressed = min(pressed_mm, MOST_COMPRESSION * depth)
-    stretch = 1.0 + pressed / depth
-    longer = probe.ending_at(face + stretch * depth)
-    if probe.near_mm != face:
-        longer = replace(longer, near_mm=face + stretch * (probe.near_mm - face))  # type: ignore[type-var]
-    _, directions = probe.scan_lines(1)
-    motion = np.eye(4)
-    motion[:3, 3] = -pressed * directions[0]
-    return longer, motion

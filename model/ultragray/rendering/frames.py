@@ -1,13 +1,13 @@
 """Poses in, frames out: `render` draws the outputs of a scene by the backend that fits, `show` turns them into what a
 display shows, and `render_shown` does both as the settings of a request want it.
 
-From scene and settings to pixels: `_views` (where the probe is, pressed or not) → `derived.Drawing` (the backend's
+From scene and settings to pixels: contact (`touch_of`, `press`) → `derived.Drawing` (the backend's
 planes; air, tools and ghosts put into them) → outputs (`ultragray.rendering.outputs`) → `show`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -19,19 +19,20 @@ from torch.nn.functional import avg_pool2d, grid_sample, pad
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import BoolArray, ElevationBeam, FloatArray, Probe
+from ultragray.geometry.probe import ElevationBeam, FloatArray, Probe
 from ultragray.geometry.scan_conversion import samples
 from ultragray.rendering.backends import cpu
 from ultragray.rendering.backends.inputs import as_array, beam_cm, scene_poses
 from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.confidence import SupportWatch
-from ultragray.rendering.contact import Skin, Touch, at_rest
+from ultragray.rendering.contact import Skin, Touch
 from ultragray.rendering.derived import Drawing, View, recorded_part
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
 from ultragray.rendering.overlays import ToolsInView
-from ultragray.rendering.settings import Contact, Resolved, Speckle, check_speckle
+from ultragray.rendering.pressing import Pressing, press
+from ultragray.rendering.settings import Contact, Resolved, Speckle, check_indentation, check_speckle
 from ultragray.rendering.tools import ScanView, Tool
 from ultragray.scene.confidence import SUPPORT_COVERAGE
 from ultragray.scene.gaussians import GaussianScene
@@ -47,9 +48,12 @@ class Frames(Mapping[str, Tensor]):
     `scene.info.label_names` tells the meaning, 0 where there is none.
     """
 
-    def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
+    def __init__(
+        self, outputs: Mapping[str, Tensor], touch: Touch | None = None, pressing: Pressing | None = None
+    ) -> None:
         self._outputs = dict(outputs)
         self.touch = touch  # the contact of each pose with the skin; None where it was assumed
+        self.pressing = pressing  # what the face does to the tissue; None without contact pressure
 
     def __getitem__(self, name: str) -> Tensor:
         return self._outputs[name]
@@ -64,6 +68,14 @@ class Frames(Mapping[str, Tensor]):
         if name not in OUTPUTS:
             raise AttributeError(f"there is no output {name!r}: outputs are {', '.join(OUTPUTS)}")
         return self._outputs.get(name)
+
+    @property
+    def contact_figures(self) -> dict[str, FloatArray]:  # [C] each
+        """Those of CONTACT_FIGURES (`ultragray.scene.confidence`) that were judged."""
+        shares = {} if self.touch is None else {"contact_share": self.touch.shares}
+        if self.pressing is None:
+            return shares
+        return {**shares, "indentation_mm": self.pressing.indentation_mm, "force_n": self.pressing.force_n}
 
     def __repr__(self) -> str:
         count, height, width = next(iter(self._outputs.values())).shape if self._outputs else (0, 0, 0)
@@ -82,6 +94,7 @@ def render(
     limits: Limits = UNLIMITED,
     beam: ElevationBeam | Tensor | None = None,
     contact: Contact | None = None,
+    indentation_mm: float | None = None,
     tools: Sequence[Tool] = (),
     ghost: float = 0.0,
     speckle: Speckle = Speckle.OFF,
@@ -96,8 +109,10 @@ def render(
     that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
     `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
     thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
-    `contact` makes scan lines off the skin dark, and compresses tissue under pressure (`ultragray.rendering.contact`);
-    the result's `touch` tells where. It follows from the poses alone, and has no gradient.
+    `contact` makes scan lines off the skin dark (`ultragray.rendering.contact`), and under pressure displaces the tissue
+    by how far the face is pressed in, or by `indentation_mm` of it (`ultragray.rendering.pressing`); the result's `touch`
+    and `pressing` tell where, how far, and with which force. Gradients pass through the displaced tissue; by poses they
+    are those of lines and displacement that stay where they are.
     `tools`, such as needles, are drawn into the frames (`ultragray.rendering.tools`); labels then are there for every
     scene. `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
     (`ultragray.rendering.overlays`). Both are the same on every backend, have no gradient, and let that of the planes
@@ -107,8 +122,8 @@ def render(
     with gradients: FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
     BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument for a contact that
-    is none, where contact is asked for and the scene knows no skin, and for speckle of a scene that does not know its
-    own.
+    is none, where contact is asked for and the scene knows no skin, for an indentation without pressure, and for
+    speckle of a scene that does not know its own.
     """
     chosen = check_outputs(outputs)
     check_available(chosen, scene.info, with_tools=bool(tools))
@@ -119,32 +134,31 @@ def render(
         int(height),
         int(width),
     )
+    contact = _checked_contact(contact)
+    check_indentation(indentation_mm, contact)
+    touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
+    pressing = None
+    if touch is not None and contact is Contact.PRESSURE:
+        pressing = press(scene, view[0], check_poses(poses), touch, indentation_mm, tools)
+        if pressing.displacement is not None:
+            scene = scene.under(*scene.displacements, pressing.displacement)
     chosen_backend = choose_backend(backend, scene)
     draw = BACKENDS[chosen_backend].draw
     scene.check_displacements(len(view[1]))
     speckle_by = chosen_backend if _checked_speckle(speckle, scene) is Speckle.NATURAL else None
-    contact = _checked_contact(contact)
-    planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
-    touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
-    drawn = []
-    for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
-        shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
-        sight = _tools_in_view(tools, view, poses, slice(first, first + len(seen[1])), shown)
-        some = scene.under(*(one.of(slice(first, first + len(seen[1]))) for one in scene.displacements))
-        drawing = Drawing(draw, some, seen, limits.after(first), shown, touching, sight, ghost, speckle_by)
-        drawing.draw(planes)
-        drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
-    whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}
-    return Frames(whole, touch)
+    shown = beam_cm(scene.info.beam if beam is None else beam, view[0])
+    sight = _tools_in_view(tools, view, poses, shown)
+    touching = None if touch is None else touch.lines
+    drawing = Drawing(draw, scene, view, limits, shown, touching, sight, ghost, speckle_by)
+    drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
+    return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen}, touch, pressing)
 
 
-def _tools_in_view(
-    tools: Sequence[Tool], view: View, poses: Any, places: slice, beam: Tensor | None
-) -> ToolsInView | None:
-    """Tools as some poses of a view see them: rigid, where they are, whatever the probe does to the tissue."""
+def _tools_in_view(tools: Sequence[Tool], view: View, poses: Any, beam: Tensor | None) -> ToolsInView | None:
+    """Tools as a view sees them: rigid, where they are, whatever the probe does to the tissue."""
     if not tools:
         return None
-    (probe, _, _, width), poses_mm = view, check_poses(poses)[places]
+    (probe, _, _, width), poses_mm = view, check_poses(poses)
     if beam is None:
         return ToolsInView(tools, ScanView(probe, poses_mm, width))
     sigma, focus, rayleigh = (10.0 * beam.detach()).tolist()
@@ -178,25 +192,6 @@ def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touc
     """
     skin = scene.prepared("skin", lambda: Skin.under(scene.training_poses, scene.info.probe))
     return Touch.of(skin, probe, poses, width)
-
-
-def _views(
-    view: View, touch: Touch | None, *, compressed: bool
-) -> Iterator[tuple[int, View, BoolArray | None]]:  # first pose, view, [C, W]
-    """What is drawn at once, in order: all poses, or each alone where pressure makes the probe of each another one."""
-    if touch is None:
-        yield 0, view, None
-    elif not compressed or not touch.pressed_mm.any():
-        yield 0, view, touch.lines
-    else:
-        probe, poses, height, width = view
-        for place, pressed_mm in enumerate(touch.pressed_mm.tolist()):
-            longer, motion_mm = at_rest(probe, pressed_mm)
-            motion_cm = motion_mm.copy()
-            motion_cm[:3, 3] /= 10.0
-            one = poses[place : place + 1]
-            moved = one @ (torch.from_numpy(motion_cm) if isinstance(one, Tensor) else motion_cm)
-            yield place, (longer, moved, height, width), touch.lines[place : place + 1]
 
 
 def footprint_pixels(
@@ -261,6 +256,7 @@ def render_shown(
         limits=limits,
         beam=settings.beam,
         contact=settings.contact,
+        indentation_mm=settings.indentation_mm,
         tools=settings.tools,
         ghost=settings.ghost,
         speckle=settings.speckle,
@@ -268,7 +264,7 @@ def render_shown(
     blackened = None
     if support is not None:
         coverage = frames["coverage"] if is_recorded else recorded_coverage(scene, settings, poses, backend=backend)
-        blackened = support.look(coverage, frames.touch)
+        blackened = support.look(coverage, frames.contact_figures)
     rendered = {name: frames[name] for name in names}
     if settings.display == AS_RENDERED and blackened is None:
         return rendered
@@ -306,6 +302,7 @@ def recorded_coverage(
         limits=limits,
         beam=settings.beam,
         contact=settings.contact,
+        indentation_mm=settings.indentation_mm,
     )
     return frames["coverage"]
 

@@ -75,6 +75,16 @@ class Contact(str, Enum):
     PRESSURE = "pressure"
 
 
+MAX_INDENTATION_MM = 50.0
+
+
+def check_indentation(indentation_mm: float | None, contact: Contact | None) -> None:
+    """Raises InvalidArgument for an indentation that is asked for without pressure."""
+    if indentation_mm is not None and contact is not Contact.PRESSURE:
+        got = "none" if contact is None else contact.value
+        raise InvalidArgument(f"indentation_mm needs contact pressure, got contact {got}", field="indentation_mm")
+
+
 class Speckle(str, Enum):
     """The speckle of a frame (`ultragray.rendering.speckle`)."""
 
@@ -135,9 +145,16 @@ class FrameSettings(Contract):
         high=MAX_THICKNESS_MM,
     )
     contact: Contact | None = described(
-        "air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the "
-        "tissue. Default: contact is assumed.",
+        "air: scan lines whose face is off the skin are dark. pressure: and tissue gives way to a face that is pressed "
+        "in, and to needles. Default: contact is assumed.",
         None,
+    )
+    indentation_mm: float | None = described(
+        "How far the face is pressed in, with contact pressure. Default: as far as it lies beyond the skin of the "
+        "training views.",
+        None,
+        low=0.0,
+        high=MAX_INDENTATION_MM,
     )
     tools: tuple[Tool, ...] | None = described(
         "Needles and the like in the image; labels then are there for every scene.", None, most=MAX_TOOLS
@@ -166,6 +183,7 @@ class FrameSettings(Contract):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "outputs", check_outputs(self.outputs))
+        check_indentation(self.indentation_mm, self.contact)
 
     least_confidence = property(_least_confidence)
 
@@ -237,6 +255,7 @@ class Additions:
         "mask: where the frame's confidence is below min_confidence, pixels without support are 0.", Below.REFUSE
     )
     contact: Contact | None = described("As used; null: it was assumed.", None)
+    indentation_mm: float | None = described("As asked for; null: as the pose tells.", None)
     tools: tuple[Tool, ...] = described("As used.", ())
     ghost: float = described("As used; 0: none.", 0.0)
     phase: tuple[float, ...] = described("Numbers of the scene's modes of motion, as used; empty: at rest.", ())

@@ -387,21 +387,30 @@ class Extrapolation:
     contact_share: float | None = described(
         "Share of the scan lines that have contact with the skin; none where contact is assumed.", None
     )
+    indentation_mm: float | None = described(
+        "How far the face presses the tissue in, a mean over these lines; none without contact pressure. A frame with "
+        "more than 0 shows tissue as it was not recorded.",
+        None,
+    )
+    force_n: float | None = described("Force of the face on the tissue, along its axis; none likewise.", None)
 
     def figures(self) -> dict[str, float | None]:
-        """FIGURES, and the share of contact where it was judged: what files hold of a frame."""
-        figures = {name: getattr(self, name) for name in FIGURES}
-        return figures if self.contact_share is None else figures | {CONTACT_SHARE: self.contact_share}
+        """FIGURES, and those of contact that were judged: what files hold of a frame."""
+        return {name: getattr(self, name) for name in FIGURES + judged_figures([self])}
 
 
-CONTACT_SHARE = "contact_share"
-FIGURES = tuple(figure.name for figure in fields(Extrapolation) if figure.name != CONTACT_SHARE)
+CONTACT_FIGURES = ("contact_share", "indentation_mm", "force_n")
+FIGURES = tuple(figure.name for figure in fields(Extrapolation) if figure.name not in CONTACT_FIGURES)
+
+
+def judged_figures(extrapolations: Sequence[Extrapolation]) -> tuple[str, ...]:
+    """Those of CONTACT_FIGURES that any frame has."""
+    return tuple(name for name in CONTACT_FIGURES if any(getattr(one, name) is not None for one in extrapolations))
 
 
 def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDArray[np.float32]]:
-    """Each of FIGURES, and the share of contact where it was judged, as [C]; NaN where one is not known."""
-    judged = any(one.contact_share is not None for one in extrapolations)
-    names = (*FIGURES, CONTACT_SHARE) if judged else FIGURES
+    """Each of FIGURES, and of those of contact that were judged, as [C]; NaN where one is not known."""
+    names = FIGURES + judged_figures(extrapolations)
     return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in names}
 
 

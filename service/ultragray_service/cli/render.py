@@ -23,7 +23,7 @@ from ultragray.files import file_sha256
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.samplers.confident import require_drawn
-from ultragray.scene.confidence import CONTACT_SHARE, Assessor, figure_arrays
+from ultragray.scene.confidence import CONTACT_FIGURES, Assessor, figure_arrays
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import poses_option, with_options
 from ultragray_service.cli.terminal import (
@@ -213,9 +213,11 @@ def render_frames(
         "confidence_max": float(confidence.max()) if knows else None,
         "supported_share": supported,
     }
-    if CONTACT_SHARE in figures:
-        document[CONTACT_SHARE] = float(figures[CONTACT_SHARE].mean())
-        trust.append(f"{document[CONTACT_SHARE]:.0%} of the scan lines have contact")
+    document |= {name: float(figures[name].mean()) for name in CONTACT_FIGURES if name in figures}
+    if "contact_share" in document:
+        trust.append(f"{document['contact_share']:.0%} of the scan lines have contact")
+    if "force_n" in document:
+        trust.append(f"pressed in by {document['indentation_mm']:.1f} mm with {document['force_n']:.1f} N")
     what = f"{frames_in_words(len(found))} of {settings.height}x{settings.width}, {', '.join(settings.outputs)}"
     return f"wrote {output}: {what}, in {seconds:.1f} s; {', '.join(trust)}", document
 

@@ -52,8 +52,8 @@ class ScanSettings(Contract):
     reached_mm: float = described("So near to the goal, an episode ends.", 1.0, low=0.0, high=100.0)
     reached_deg: float = described("And turned from it by at most so much.", 2.0, low=0.0, high=90.0)
     contact: Contact | None = described(
-        "air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the "
-        "tissue. None: contact is assumed.",
+        "air: scan lines whose face is off the skin are dark. pressure: and tissue gives way to a face that is pressed "
+        "in, and to needles. None: contact is assumed.",
         Contact.AIR,
     )
     with_pose: bool = described("Observe the pose beside the frame.", False)

@@ -19,8 +19,8 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray, in_type
-from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
-from ultragray.scene.confidence import Extrapolation, figure_arrays
+from ultragray.rendering.settings import Contact, Encoding, Resolved, SettingsUsed, settings_used
+from ultragray.scene.confidence import CONTACT_FIGURES, Extrapolation, figure_arrays
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
@@ -117,8 +117,9 @@ class Exporter(ABC):
     def _figures(self) -> dict[str, npt.NDArray[np.float32]]:
         """The figures of all frames by name, [C]; NaN where one is not known, or the frame is still to come."""
         missing = len(self._header.poses) - len(self._extrapolations)
-        judged = None if self._header.settings.contact is None else math.nan
-        unknown = Extrapolation(None, None, None, None, contact_share=judged)
+        contact = self._header.settings.contact
+        judged = CONTACT_FIGURES if contact is Contact.PRESSURE else CONTACT_FIGURES[: contact is not None]
+        unknown = Extrapolation(None, None, None, None, **dict.fromkeys(judged, math.nan))
         return figure_arrays([*self._extrapolations, *[unknown] * missing])
 
     @abstractmethod

@@ -23,6 +23,8 @@ FIELDS = {
     "confidence": "UltraGRayConfidence",
     "supported_share": "UltraGRaySupportedShare",
     "contact_share": "UltraGRayContactShare",
+    "indentation_mm": "UltraGRayIndentationMm",
+    "force_n": "UltraGRayForceN",
 }
 FIGURE_WIDTH = 12  # of any number from 0 on, so that those found later take the place of these
 
