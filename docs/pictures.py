@@ -19,8 +19,8 @@ from typing import Any
 import cv2
 import matplotlib as mpl
 import numpy as np
-import torch
 import numpy.typing as npt
+import torch
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -229,7 +229,9 @@ def draw_pressing(scene: GaussianScene, path: Path) -> None:
     assert frames.pressing.displacement is not None
     x, z = np.linspace(-28.0, 28.0, 113), np.arange(5.0, 60.0, 5.0)
     rows = np.stack(np.broadcast_arrays(x, 0.0, z[:, None]), axis=-1)
-    columns = np.stack(np.broadcast_arrays(np.arange(-25.0, 26.0, 5.0)[:, None], 0.0, np.linspace(0.0, 60.0, 121)), axis=-1)
+    columns = np.stack(
+        np.broadcast_arrays(np.arange(-25.0, 26.0, 5.0)[:, None], 0.0, np.linspace(0.0, 60.0, 121)), axis=-1
+    )
     figure, panels = panel_row(rows=1, columns=2)
     for number, panel in enumerate(panels):
         panel.imshow(frames["bmode"][number].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)

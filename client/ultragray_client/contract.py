@@ -273,9 +273,12 @@ class FrameSettings:
     below_min_confidence: Below = Below.REFUSE  # mask: pixels of such frames that Gaussians do not support are 0.
     # Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.
     slice_thickness_mm: float | None = None
-    # air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the
-    # tissue. Default: contact is assumed.
+    # air: scan lines whose face is off the skin are dark. pressure: and tissue gives way to a face that is pressed
+    # in, and to needles. Default: contact is assumed.
     contact: Contact | None = None
+    # How far the face is pressed in, with contact pressure. Default: as far as it lies beyond the skin of the
+    # training views.
+    indentation_mm: float | None = None
     tools: tuple[Tool, ...] | None = None  # Needles and the like in the image; labels then are there for every scene.
     # Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
     # before it. Default: 0.
@@ -321,6 +324,7 @@ class Additions:
     # mask: where the frame's confidence is below min_confidence, pixels without support are 0.
     below_min_confidence: Below = Below.REFUSE
     contact: Contact | None = None  # As used; null: it was assumed.
+    indentation_mm: float | None = None  # As asked for; null: as the pose tells.
     tools: tuple[Tool, ...] = ()  # As used.
     ghost: float = 0.0  # As used; 0: none.
     phase: tuple[float, ...] = ()  # Numbers of the scene's modes of motion, as used; empty: at rest.
@@ -355,6 +359,10 @@ class Extrapolation:
     supported_share: float | None  # Share of the pixels that Gaussians support: coverage of at least 0.3.
     # Share of the scan lines that have contact with the skin; none where contact is assumed.
     contact_share: float | None = None
+    # How far the face presses the tissue in, a mean over these lines; none without contact pressure. A frame with
+    # more than 0 shows tissue as it was not recorded.
+    indentation_mm: float | None = None
+    force_n: float | None = None  # Force of the face on the tissue, along its axis; none likewise.
 
 
 @dataclass(frozen=True)

@@ -507,8 +507,10 @@ namespace Ultragray
         public Below BelowMinConfidence { get; set; } = Below.Refuse;
         /// <summary>Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.</summary>
         public double? SliceThicknessMm { get; set; }
-        /// <summary>air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the tissue. Default: contact is assumed.</summary>
+        /// <summary>air: scan lines whose face is off the skin are dark. pressure: and tissue gives way to a face that is pressed in, and to needles. Default: contact is assumed.</summary>
         public Contact? Contact { get; set; }
+        /// <summary>How far the face is pressed in, with contact pressure. Default: as far as it lies beyond the skin of the training views.</summary>
+        public double? IndentationMm { get; set; }
         /// <summary>Needles and the like in the image; labels then are there for every scene.</summary>
         public Tool[] Tools { get; set; }
         /// <summary>Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies before it. Default: 0.</summary>
@@ -532,6 +534,7 @@ namespace Ultragray
             json.Member("below_min_confidence", Words.Below[(int)BelowMinConfidence]);
             json.Member("slice_thickness_mm", SliceThicknessMm);
             json.Member("contact", Contact == null ? null : Words.Contact[(int)Contact.Value]);
+            json.Member("indentation_mm", IndentationMm);
             json.Member("tools", Tools);
             json.Member("ghost", Ghost);
             json.Member("phase", Phase);
@@ -600,6 +603,10 @@ namespace Ultragray
         public double? SupportedShare { get; set; }
         /// <summary>Share of the scan lines that have contact with the skin; none where contact is assumed.</summary>
         public double? ContactShare { get; set; }
+        /// <summary>How far the face presses the tissue in, a mean over these lines; none without contact pressure. A frame with more than 0 shows tissue as it was not recorded.</summary>
+        public double? IndentationMm { get; set; }
+        /// <summary>Force of the face on the tissue, along its axis; none likewise.</summary>
+        public double? ForceN { get; set; }
         public void Read(JsonReader json)
         {
             if (!json.Enter('{')) return;
@@ -610,6 +617,8 @@ namespace Ultragray
                 else if (json.Named("confidence")) Confidence = json.NumberOrNull();
                 else if (json.Named("supported_share")) SupportedShare = json.NumberOrNull();
                 else if (json.Named("contact_share")) ContactShare = json.NumberOrNull();
+                else if (json.Named("indentation_mm")) IndentationMm = json.NumberOrNull();
+                else if (json.Named("force_n")) ForceN = json.NumberOrNull();
                 else json.Skip();
             }
         }
@@ -742,6 +751,8 @@ namespace Ultragray
         public Below BelowMinConfidence { get; set; } = Below.Refuse;
         /// <summary>As used; null: it was assumed.</summary>
         public Contact? Contact { get; set; }
+        /// <summary>As asked for; null: as the pose tells.</summary>
+        public double? IndentationMm { get; set; }
         /// <summary>As used.</summary>
         public Tool[] Tools { get; set; }
         /// <summary>As used; 0: none.</summary>
@@ -798,6 +809,7 @@ namespace Ultragray
                 else if (json.Named("min_confidence")) MinConfidence = json.NumberOrNull();
                 else if (json.Named("below_min_confidence")) BelowMinConfidence = (Below)json.Word(Words.Below);
                 else if (json.Named("contact")) Contact = json.IsNull() ? null : (Contact?)json.Word(Words.Contact);
+                else if (json.Named("indentation_mm")) IndentationMm = json.NumberOrNull();
                 else if (json.Named("tools")) Tools = json.Elements(Tools, Tool.ReadOne);
                 else if (json.Named("ghost")) Ghost = json.Number();
                 else if (json.Named("phase")) Phase = json.Numbers(Phase);
@@ -820,7 +832,7 @@ namespace Ultragray
         }
         internal static readonly string[] Texts = { "scene", "scene_sha256", "renderer", "below_min_confidence", "contact", "speckle", "registration", "encoding" };
         internal static readonly string[] TextLists = { "outputs" };
-        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "sent_ms", "clock", "age_ms", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "tools", "ghost", "phase", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction", "preview" };
+        internal static readonly string[] Others = { "sequence", "client_time_ms", "dropped", "sent_ms", "clock", "age_ms", "pose", "extrapolation", "queue_ms", "render_ms", "encode_ms", "min_confidence", "indentation_mm", "tools", "ghost", "phase", "probe", "slice_thickness_mm", "rendered_height", "rendered_width", "display", "height", "width", "picture", "prediction", "preview" };
     }
 
     /// <summary>An error where a call as a whole does not fail.</summary>

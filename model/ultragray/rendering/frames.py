@@ -7,7 +7,7 @@ planes; air, tools and ghosts put into them) → outputs (`ultragray.rendering.o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -109,10 +109,10 @@ def render(
     that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
     `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
     thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
-    `contact` makes scan lines off the skin dark (`ultragray.rendering.contact`), and under pressure displaces the tissue
-    by how far the face is pressed in, or by `indentation_mm` of it (`ultragray.rendering.pressing`); the result's `touch`
-    and `pressing` tell where, how far, and with which force. Gradients pass through the displaced tissue; by poses they
-    are those of lines and displacement that stay where they are.
+    `contact` makes scan lines off the skin dark (`ultragray.rendering.contact`), and under pressure displaces the
+    tissue by how far the face is pressed in, or by `indentation_mm` of it (`ultragray.rendering.pressing`); the
+    result's `touch` and `pressing` tell where, how far, and with which force. Gradients pass through the displaced
+    tissue; by poses they are those of lines and displacement that stay where they are.
     `tools`, such as needles, are drawn into the frames (`ultragray.rendering.tools`); labels then are there for every
     scene. `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
     (`ultragray.rendering.overlays`). Both are the same on every backend, have no gradient, and let that of the planes

@@ -1,11 +1,11 @@
 """Tissue that gives way to a face that is pressed in, and to needles that are pushed in.
 
 Under the face the displacement is that of elastic layers under a rigid punch of the face's outline, which touches where
-the skin is before it and does not stick (model/kernels/pressing.hpp): layers are the mean of the tissue under the
-training views, by the stiffness of its labels (model/kernels/stiffness.hpp); where a column of tissue is softer or stiffer than its layer, it is
-compressed by as much more or less, and bone stays with all that lies behind it. Tissue keeps its volume, so that it
-goes aside. What is returned displaces the scene (`ultragray.scene.deformation`): `ultragray.rendering.frames` asks for
-it with what `contact` tells of the skin.
+the skin is before it and does not stick (model/kernels/pressing.hpp). Layers are the mean of the tissue under the
+training views, by the stiffness of its labels (model/kernels/stiffness.hpp). Where a column of tissue is softer or
+stiffer than its layer, it is compressed by as much more or less, and bone stays with all that lies behind it. Tissue
+keeps its volume, so that it goes aside. What is returned displaces the scene (`ultragray.scene.deformation`);
+`ultragray.rendering.frames` asks for it with what `contact` tells of the skin.
 """
 
 from __future__ import annotations

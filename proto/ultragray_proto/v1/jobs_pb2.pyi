@@ -183,7 +183,7 @@ class VoxelizeJob(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., field: _Optional[str] = ..., spacing_mm: _Optional[float] = ..., box_mm: _Optional[str] = ..., format: _Optional[str] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class RenderJob(_message.Message):
-    __slots__ = ("pose_count", "scene", "poses", "sampler", "height", "width", "outputs", "format", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "max_run_s", "slice_thickness_mm", "shard_frames", "contact", "tools", "ghost", "device", "min_memory_gb", "worker_labels", "registration", "speckle", "phase", "breathing")
+    __slots__ = ("pose_count", "scene", "poses", "sampler", "height", "width", "outputs", "format", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "max_run_s", "slice_thickness_mm", "shard_frames", "contact", "tools", "ghost", "device", "min_memory_gb", "worker_labels", "registration", "speckle", "phase", "breathing", "indentation_mm")
     class WorkerLabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -217,6 +217,7 @@ class RenderJob(_message.Message):
     SPECKLE_FIELD_NUMBER: _ClassVar[int]
     PHASE_FIELD_NUMBER: _ClassVar[int]
     BREATHING_FIELD_NUMBER: _ClassVar[int]
+    INDENTATION_MM_FIELD_NUMBER: _ClassVar[int]
     pose_count: int
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
@@ -243,7 +244,8 @@ class RenderJob(_message.Message):
     speckle: _rendering_pb2.Speckle
     phase: _containers.RepeatedScalarFieldContainer[float]
     breathing: _scenes_pb2.Breathing
-    def __init__(self, pose_count: _Optional[int] = ..., scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., max_run_s: _Optional[float] = ..., slice_thickness_mm: _Optional[float] = ..., shard_frames: _Optional[int] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[_rendering_pb2.Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., breathing: _Optional[_Union[_scenes_pb2.Breathing, _Mapping]] = ...) -> None: ...
+    indentation_mm: float
+    def __init__(self, pose_count: _Optional[int] = ..., scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., max_run_s: _Optional[float] = ..., slice_thickness_mm: _Optional[float] = ..., shard_frames: _Optional[int] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[_rendering_pb2.Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., breathing: _Optional[_Union[_scenes_pb2.Breathing, _Mapping]] = ..., indentation_mm: _Optional[float] = ...) -> None: ...
 
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")

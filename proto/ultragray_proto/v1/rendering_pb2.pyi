@@ -91,7 +91,7 @@ STREAM_MODE_ORDERED: StreamMode
 STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "speckle", "phase", "breathing")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "speckle", "phase", "breathing", "indentation_mm")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
@@ -109,6 +109,7 @@ class RenderSettings(_message.Message):
     SPECKLE_FIELD_NUMBER: _ClassVar[int]
     PHASE_FIELD_NUMBER: _ClassVar[int]
     BREATHING_FIELD_NUMBER: _ClassVar[int]
+    INDENTATION_MM_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
@@ -126,21 +127,26 @@ class RenderSettings(_message.Message):
     speckle: Speckle
     phase: _containers.RepeatedScalarFieldContainer[float]
     breathing: _scenes_pb2.Breathing
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., breathing: _Optional[_Union[_scenes_pb2.Breathing, _Mapping]] = ...) -> None: ...
+    indentation_mm: float
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., breathing: _Optional[_Union[_scenes_pb2.Breathing, _Mapping]] = ..., indentation_mm: _Optional[float] = ...) -> None: ...
 
 class Extrapolation(_message.Message):
-    __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share")
+    __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share", "indentation_mm", "force_n")
     DISTANCE_MM_FIELD_NUMBER: _ClassVar[int]
     ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SUPPORTED_SHARE_FIELD_NUMBER: _ClassVar[int]
     CONTACT_SHARE_FIELD_NUMBER: _ClassVar[int]
+    INDENTATION_MM_FIELD_NUMBER: _ClassVar[int]
+    FORCE_N_FIELD_NUMBER: _ClassVar[int]
     distance_mm: float
     angle_deg: float
     confidence: float
     supported_share: float
     contact_share: float
-    def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ..., contact_share: _Optional[float] = ...) -> None: ...
+    indentation_mm: float
+    force_n: float
+    def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ..., contact_share: _Optional[float] = ..., indentation_mm: _Optional[float] = ..., force_n: _Optional[float] = ...) -> None: ...
 
 class AssessPosesRequest(_message.Message):
     __slots__ = ("scene", "poses", "probe", "registration")
@@ -461,7 +467,7 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ..., predict_ms: _Optional[float] = ..., real: _Optional[_Union[RealFrame, _Mapping]] = ..., clock: _Optional[_Union[ClockStamps, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "prediction", "preview", "sent_ns", "clock", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence", "speckle", "phase")
+    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "prediction", "preview", "sent_ns", "clock", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence", "speckle", "phase", "indentation_mm")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     SHARED_DATA_FIELD_NUMBER: _ClassVar[int]
@@ -496,6 +502,7 @@ class Frame(_message.Message):
     BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SPECKLE_FIELD_NUMBER: _ClassVar[int]
     PHASE_FIELD_NUMBER: _ClassVar[int]
+    INDENTATION_MM_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     data: bytes
     shared_data: SharedData
@@ -530,7 +537,8 @@ class Frame(_message.Message):
     below_min_confidence: BelowConfidence
     speckle: Speckle
     phase: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., prediction: _Optional[_Union[Prediction, _Mapping]] = ..., preview: _Optional[_Union[Preview, _Mapping]] = ..., sent_ns: _Optional[int] = ..., clock: _Optional[_Union[ClockOffset, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., speckle: _Optional[_Union[Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ...) -> None: ...
+    indentation_mm: float
+    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., prediction: _Optional[_Union[Prediction, _Mapping]] = ..., preview: _Optional[_Union[Preview, _Mapping]] = ..., sent_ns: _Optional[int] = ..., clock: _Optional[_Union[ClockOffset, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., speckle: _Optional[_Union[Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., indentation_mm: _Optional[float] = ...) -> None: ...
 
 class Prediction(_message.Message):
     __slots__ = ("ahead_ms", "error_mm", "error_deg")
