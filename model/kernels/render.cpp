@@ -77,20 +77,22 @@ class Fields {
             for (const Displacement& one : displacements) add(one, first + c);
     }
 
+    // Of how far tissue comes apart, only what is along elevation decides which Gaussians the plane may cut: a mean's
+    // distance from it, and Fᵀ n for the reach. Of the last field that is the slope of one component, of those before it of
+    // all.
     void apply(View& view, int c) const {
         view.fields = fields_.data() + int64_t(c) * each_;
         view.field_count = each_;
         double stretched = 1, least = 0, most = 0;
+        std::vector<float> along;
         for (int f = 0; f < each_; ++f) {
             const Field& field = view.fields[f];
-            stretched *= 1 + field.steepest;
-            float low = std::numeric_limits<float>::max(), high = -low;
-            for (int64_t i = 0; i < int64_t(field.size[0]) * field.size[1] * field.size[2]; ++i) {
-                float along = 0;
-                for (int d = 0; d < 3; ++d) along += float(view.axes[1][d]) * field.coefficients[4 * i + d];
-                low = std::min(low, along), high = std::max(high, along);
-            }
-            least += low, most += high;
+            along.assign(int64_t(field.size[0]) * field.size[1] * field.size[2], 0.0f);
+            for (size_t i = 0; i < along.size(); ++i)
+                for (int d = 0; d < 3; ++d) along[i] += float(view.axes[1][d]) * field.coefficients[4 * i + d];
+            const auto [low, high] = std::minmax_element(along.begin(), along.end());
+            least += *low, most += *high;
+            stretched *= 1 + (f + 1 < each_ ? field.steepest : steepest(field, along.data(), 1, 1));
         }
         const double slack = 1e-5 * (most - least);
         view.stretch = static_cast<float>((stretched - 1) * (1 + 1e-5));
@@ -100,6 +102,29 @@ class Fields {
     int each() const { return each_; }
 
  private:
+    // Bound of the norm of the gradient of some components at the nodes of a field, [X, Y, Z, stride]: between neighbours
+    // along an axis of the grid a spline's slope is a mean of their differences.
+    static float steepest(const Field& field, const float* nodes, int stride, int components) {
+        double squares = 0;
+        for (int a = 0; a < 3; ++a) {
+            float longest = 0;
+            double per_cm = 0;
+            for (int e = 0; e < 3; ++e) per_cm += field.to_grid[a][e] * field.to_grid[a][e];
+            const int end[3] = {field.size[0] - (a == 0), field.size[1] - (a == 1), field.size[2] - (a == 2)};
+            const int64_t next = stride * (field.place(a == 0, a == 1, a == 2) / 4);
+            for (int i = 0; i < end[0]; ++i)
+                for (int j = 0; j < end[1]; ++j)
+                    for (int k = 0; k < end[2]; ++k) {
+                        const float* here = nodes + stride * (field.place(i, j, k) / 4);
+                        float step = 0;
+                        for (int d = 0; d < components; ++d) step += (here[next + d] - here[d]) * (here[next + d] - here[d]);
+                        longest = std::max(longest, step);
+                    }
+            squares += longest * per_cm;
+        }
+        return static_cast<float>(std::sqrt(squares) * (1 + 1e-5));
+    }
+
     void add(const Displacement& one, int pose) {
         Field field{};
         std::copy_n(one.size, 3, field.size);
@@ -109,23 +134,7 @@ class Fields {
         const float* from = one.coefficients + (one.has_many ? floats * pose : 0);
         for (int64_t i = 0; i < floats / 3; ++i) std::copy_n(from + 3 * i, 3, &packed[4 * i]);
         field.coefficients = packed.data();
-        // Between neighbours along an axis of the grid a spline's slope is a mean of their differences.
-        double squares = 0;
-        for (int a = 0; a < 3; ++a) {
-            double longest = 0, per_cm = 0;
-            for (int e = 0; e < 3; ++e) per_cm += field.to_grid[a][e] * field.to_grid[a][e];
-            const int end[3] = {field.size[0] - (a == 0), field.size[1] - (a == 1), field.size[2] - (a == 2)};
-            for (int i = 0; i < end[0]; ++i)
-                for (int j = 0; j < end[1]; ++j)
-                    for (int k = 0; k < end[2]; ++k) {
-                        const float *here = field.at(i, j, k), *next = field.at(i + (a == 0), j + (a == 1), k + (a == 2));
-                        double step = 0;
-                        for (int d = 0; d < 3; ++d) step += double(next[d] - here[d]) * (next[d] - here[d]);
-                        longest = std::max(longest, step);
-                    }
-            squares += longest * per_cm;
-        }
-        field.steepest = static_cast<float>(std::sqrt(squares));
+        field.steepest = steepest(field, packed.data(), 4, 3);
         packed_.push_back(std::move(packed));
         fields_.push_back(field);
     }
