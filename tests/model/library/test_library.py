@@ -160,7 +160,7 @@ class Scene:
         assert view, self.problem
         pixels = np.empty((len(poses), self.library.ultragray_frame_bytes(view)), np.uint8)
         matrices = np.ascontiguousarray(poses, np.float64)
-        figures = np.empty((len(poses), 5))
+        figures = np.empty((len(poses), 7))
         where = matrices.ctypes.data, len(poses), 2, pixels.ctypes.data, figures.ctypes.data
         code = self.library.ultragray_render(view, *where)
         info = json.loads(self.library.ultragray_view_info(view))
