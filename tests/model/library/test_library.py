@@ -47,8 +47,6 @@ EXACT = [
     {"speckle": "natural", "encoding": "float32"},
     {"speckle": "natural", "probe": "C5-2", "height": 200, "width": 90, "display": {"depth_mm": 120}},
     {"contact": "air", "outputs": ["bmode", "transmittance", "echo", "attenuation"]},
-    {"contact": "pressure", "encoding": "float32", "outputs": ["bmode", "labels"]},
-    {"contact": "pressure", "speckle": "natural", "ghost": 0.5, "height": 160, "width": 120},
     {"outputs": ["uncertainty", "bmode"], "height": 100, "width": 77},
     {
         "display": {"gain_db_between": [-6, 6], "dynamic_range_db_between": [40, 70], "display_seed": 5},
@@ -83,6 +81,8 @@ PUT_IN = [
     {"ghost": 0.4, "tools": [BOX | {"frame": "probe"}], "probe": "P4-2"},
 ]
 INTERPOLATED = [
+    {"contact": "pressure", "encoding": "float32", "outputs": ["bmode", "labels"]},
+    {"contact": "pressure", "speckle": "natural", "ghost": 0.5, "encoding": "float32", "height": 160, "width": 120},
     {"display": {"pixel_mm": 0.5}, "encoding": "float32"},
     {"probe": {"kind": "radial", "near_mm": 2, "far_mm": 30}, "display": {"pixel_mm": 0.5}, "encoding": "float32"},
     {
@@ -105,7 +105,7 @@ class Plan(ctypes.Structure):
         ("origin", ctypes.c_double * 3),
         *((name, ctypes.c_double) for name in ("near_cm", "row_cm", "most_cm", "start", "span")),
         ("beam", ctypes.c_double * 4),
-        *((name, ctypes.c_double) for name in ("fanned", "wrap", "height", "width", *PLANES)),
+        *((name, ctypes.c_double) for name in ("fanned", "wrap", "height", "width", *PLANES, "displaced")),
     ]
 
 
@@ -248,9 +248,7 @@ def test_frames_are_those_of_python_byte_for_byte(scene, python_scene, settings)
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize(
-    "settings", [one for one in (*EXACT, *PUT_IN) if one.get("contact") != "pressure"], ids=json.dumps
-)
+@pytest.mark.parametrize("settings", [*EXACT, *PUT_IN], ids=json.dumps)
 def test_planes_drawn_by_a_plan_become_the_frame(scene, python_scene, settings):
     """The planes are those of the view without tools, ghosts and display settings."""
     library = scene.library
