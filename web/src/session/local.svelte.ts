@@ -135,6 +135,7 @@ export class LocalFrames {
       rendered_height: settings.height ?? description?.image_height ?? 0,
       rendered_width: settings.width ?? description?.image_width ?? 0,
       tools: settings.tools ?? [],
+      phase: settings.phase ?? [],
       scene: name,
       renderer: PAGE,
       sequence: 0,
