@@ -100,12 +100,16 @@ class Program:
         """The rest of the next line that begins with these words."""
         begin = " ".join(map(str, words))
         while True:
-            wait_until(lambda: not self._lines.empty())
-            line = self._lines.get()
-            assert line is not None, f"it ended before it said {begin!r}: {self.told}"
-            self.told.append(line)
+            line = self.next_line()
             if line == begin or line.startswith(f"{begin} "):
                 return line.removeprefix(begin).strip()
+
+    def next_line(self):
+        wait_until(lambda: not self._lines.empty())
+        line = self._lines.get()
+        assert line is not None, f"it ended, after {self.told}"
+        self.told.append(line)
+        return line
 
     def end(self):
         """Its last lines, once its input has ended."""

@@ -159,7 +159,11 @@ def told(headers):
         "tools": json.loads(headers.get("X-Ultragray-Tools", "[]")),
         "ghost": float(headers.get("X-Ultragray-Ghost", 0.0)),
         "speckle": headers.get("X-Ultragray-Speckle", "off"),
-        **({"phase": json.loads(headers["X-Ultragray-Phase"])} if "X-Ultragray-Phase" in headers else {}),
+        **{
+            setting: json.loads(headers[header])
+            for setting, header in (("indentation_mm", "X-Ultragray-Indentation-Mm"), ("phase", "X-Ultragray-Phase"))
+            if header in headers
+        },
         "dtype": headers["X-Ultragray-Dtype"],
         "outputs": headers["X-Ultragray-Outputs"].split(","),
     }

@@ -371,7 +371,7 @@ def random_request(random, scene):
 def test_random_frames_are_those_of_python(scene, python_scene, seed):
     settings, pose = random_request(np.random.default_rng(seed), python_scene)
     display = settings.get("display", {})
-    rounded = bool({"tools", "ghost"} & set(settings)) or "pixel_mm" in display
+    rounded = bool({"tools", "ghost"} & set(settings)) or "pixel_mm" in display or settings.get("contact") == "pressure"
     enlarged = (1.0 + 2.0 * display.get("edge", 0.0)) * 2.0  # by edges, and by a small dynamic range
     outputs = from_dict(RenderSettings, settings).outputs
     for name, (found, expected) in zip(outputs, both(scene, python_scene, settings, pose[None]), strict=True):

@@ -20,7 +20,7 @@ from ultragray.datasets.source import load_dataset
 from ultragray.installation import install_advice
 from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
-from ultragray.learn.training import TrainingConfig, train, trainer
+from ultragray.learn.training import TrainingConfig, batch, train
 from ultragray.learn.training.geometry import Geometry
 
 from ...waiting import Deadline
@@ -102,7 +102,7 @@ def test_says_what_is_missing_without_a_gpu(dataset, tmp_path, monkeypatch, opti
 
 
 def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, monkeypatch):
-    true_loss, calls = trainer.image_loss, 0
+    true_loss, calls = batch.image_loss, 0
 
     def loss_that_runs_out(rendered, truth, *settings):
         nonlocal calls
@@ -111,7 +111,7 @@ def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, mon
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return true_loss(rendered, truth, *settings)
 
-    monkeypatch.setattr(trainer, "image_loss", loss_that_runs_out)
+    monkeypatch.setattr(batch, "image_loss", loss_that_runs_out)
     output = tmp_path / "scene.ugr"
     told = refused_run(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
     assert "did not suffice after step 5 with 60 Gaussians" in told
@@ -123,14 +123,14 @@ def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, mon
 
 SIGNALLED = """
 import os
-from ultragray.learn.training import trainer
-true_loss, calls = trainer.image_loss, []
+from ultragray.learn.training import batch
+true_loss, calls = batch.image_loss, []
 def loss(*arguments):
     calls.append(None)
     if len(calls) == 6:
         os.kill(os.getpid(), {number})
     return true_loss(*arguments)
-trainer.image_loss = loss
+batch.image_loss = loss
 """
 
 

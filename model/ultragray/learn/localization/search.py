@@ -81,7 +81,7 @@ FINE = Stage(128, 96, 0.8, 4, 0.3, 4)
 LAST = Stage(128, 96, 0.5, 6, 0.2, 4)
 STAGES = (COARSE, MIDDLE, FINE, MIDDLE, FINE, LAST)
 TRACKING = (  # from the frame before, by a tenth of the frames
-    Stage(96, 72, 1.0, 1, 0.3, 1, rendered=(ELEVATION,)),
+    Stage(96, 72, 1.0, 2, 0.3, 1, rendered=(ELEVATION,)),
     Stage(96, 72, 0.5, 3, 0.3, 4, rendered=(ELEVATION,)),
 )
 MOST_BEGUN = 6  # poses at the coarse stage
