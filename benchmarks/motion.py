@@ -23,12 +23,12 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import DEMO_PROBE, load_demo_scene
 from ultragray.phantom.sweeps import freehand_poses
 from ultragray.scene.deformation import Displacement
+from ultragray.scene.modes import FIT_STEPS
 
 THREADS = 2
 SIDE, PASSES, FRAMES, HELD_OUT = 96, 4, 40, 24
 BREATHS, DEPTH_MM = 8, 6.0
-CONFIG = TrainingConfig(steps=300, max_gaussians=8000, effort=1.0, confidence=False)
-FIT_STEPS = 500
+FIRST_STEPS = 300  # of the training that the fit begins with; the marks are trained by as many as both together
 
 
 def truth(numbers: np.ndarray) -> Displacement:  # [F] from 0 to 1
@@ -80,9 +80,14 @@ def learned(_: Path) -> Document:
     still = sweep_of(patient, poses, rest)
     still_held = sweep_of(patient, held_poses, rest[:HELD_OUT])
     marks = {}
-    for name, train_sweep, val in (("still", still, still_held), ("static", breathing, held_out)):
-        marks[name] = train(Dataset(name, train_sweep, val), CONFIG)
-    moving = fit_motion(marks["static"], breathing, numbers, steps=FIT_STEPS)
+    for name, train_sweep, val, steps in (
+        ("still", still, still_held, FIRST_STEPS + FIT_STEPS),
+        ("static", breathing, held_out, FIRST_STEPS + FIT_STEPS),
+        ("first", breathing, held_out, FIRST_STEPS),
+    ):
+        config = TrainingConfig(steps=steps, max_gaussians=8000, effort=1.0, confidence=False)
+        marks[name] = train(Dataset(name, train_sweep, val), config)
+    moving = fit_motion(marks["first"], breathing, numbers)
     # Points of the frames that have tissue, at rest in either scene: from there to full breath.
     corners = poses[::5, :3, 3][:, None] + poses[::5, :3, 2][:, None] * np.linspace(12.0, 45.0, 8)[:, None]
     points = torch.from_numpy(corners.reshape(-1, 3)).float()

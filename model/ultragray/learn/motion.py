@@ -25,13 +25,13 @@ from ultragray.rendering.frames import render
 from ultragray.scene.deformation import LEAST_SIDE, Displacement, spline_coefficients
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 from ultragray.scene.info import SceneInfo, with_summary
-from ultragray.scene.modes import MAX_SIDE, Mode, Motion, Moving
+from ultragray.scene.modes import FIT_STEPS, MAX_SIDE, Mode, Motion, Moving
 
 Numbers = npt.NDArray[np.float64]
 
 SPACING_MM, CHEST_SPACING_MM = 15.0, 6.0  # between splines: of a field that is learned, of the chest
 BATCH = 4
-RATES = {"means": 1e-3, "scales": 5e-3, "quats": 5e-3, "transmittances": 5e-3, "sh0": 1e-2, "shN": 1e-4}
+RATES = {"means": 1e-2, "scales": 1e-2, "quats": 1e-2, "transmittances": 1e-2, "sh0": 2e-2, "shN": 1e-4}
 FIELD_RATE_MM = 0.25  # a step, of the displacement from end to end
 BENDING = 1e-3  # price of a squared second difference of the field, 1/mm²
 TEXTURE = 0.5  # share of 1 − SSIM in the loss
@@ -57,7 +57,7 @@ def fit_motion(
     *,
     name: str = "breathing",
     surrogate: str = "",
-    steps: int = 400,
+    steps: int = FIT_STEPS,
     spacing_mm: float = SPACING_MM,
     report: Callable[[int, float], None] = lambda step, loss: None,
 ) -> GaussianScene:

@@ -28,6 +28,7 @@ from ultragray.geometry.pose import MAX_POSITION_MM
 MOTION_KEY = "ultragray.motion"  # in the metadata of a scene file
 MAX_MODES, MAX_SIDE = 8, 64
 MAX_COEFFICIENT_BYTES = 2**20  # of a header of 4 MiB, where they take a third more
+FIT_STEPS = 3000  # of the fit of a mode to a sweep
 BEYOND = 1.0  # spans outside what was seen to which numbers may go
 DOUBT = 2.0  # by how much, at one span outside, the logarithm of the confidence has fallen
 

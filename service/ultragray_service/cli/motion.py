@@ -7,6 +7,7 @@ from typing import Annotated
 
 from ultragray.errors import InvalidArgument
 from ultragray.scene.info import read_header
+from ultragray.scene.modes import FIT_STEPS
 from ultragray_service.cli.terminal import (
     COMPRESSED_SUFFIX,
     SCENE_SUFFIX,
@@ -33,7 +34,7 @@ def motion(
     surrogate: Annotated[Path | None, option("A number a line for each frame of the sweep, such as a belt's.")] = None,
     chest_mm: Annotated[float | None, option("Built in: deep tissue goes so far from the skin and back.")] = None,
     name: Annotated[str, option("Of the mode.")] = "breathing",
-    steps: Annotated[int, option("Of the fit.", min=1, max=100_000)] = 400,
+    steps: Annotated[int, option("Of the fit.", min=1, max=100_000)] = FIT_STEPS,
     force: Force = False,
     json: Json = False,
 ) -> None:
