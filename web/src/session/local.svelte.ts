@@ -128,8 +128,9 @@ export class LocalFrames {
   /** What the service would tell of a frame with such settings. */
   #told(settings: StreamSettings) {
     const { name, description, own } = this.scene;
+    const { breathing: _, ...asked } = settings; // of which a frame tells the phase
     return {
-      ...settings,
+      ...asked,
       probe: settings.probe ?? own.probe,
       slice_thickness_mm: settings.slice_thickness_mm ?? description?.beam?.thickness_mm ?? 0,
       rendered_height: settings.height ?? description?.image_height ?? 0,
