@@ -255,7 +255,7 @@ test("what is wrong is said in a sentence", async () => {
       await told(() => scene.render(pose, { height: 4 })),
     ];
   });
-  const expected = [/cut off/, /not-there\.ugr cannot be fetched: 404/, /height must be/, /16 numbers/, /poses\[0\] must/, /^nothing$/];
+  const expected = [/cut off/, /not-there\.ugr cannot be fetched: 404/, /height must be/, /16 numbers/, /^pose(s\[0\])? must end in the row 0 0 0 1$/, /^nothing$/];
   problems.forEach((problem, at) => assert.match(problem, expected[at]));
   await page.close();
 });
