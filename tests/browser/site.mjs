@@ -46,7 +46,7 @@ export async function differences({ MOST, renderer }) {
   const largest = { off: 0, natural: 0 };
   for (const { scene, pose, settings, enlarged } of requests) {
     const frame = await scenes[scene].render(pose, settings);
-    frames += scenes[scene].renderer === renderer;
+    frames += scenes[scene].renderer === renderer || settings.contact === "pressure"; // tissue that gives way is drawn by WebAssembly
     const kind = settings.speckle ?? "off";
     for (const output of frame.info.outputs) {
       const pixels = frame.pixels(output);
