@@ -54,8 +54,7 @@ RENDER_HEADERS = {
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
-    "indentation_mm, force_n, "
-    "JSON. Of many, npz holds them.",
+    "indentation_mm, force_n, JSON. Of many, npz holds them.",
     **{_header_of(one.name): one.metadata["description"] for one in fields(SettingsUsed)},
     "X-Ultragray-Queue-Ms": "Waiting time.",
     "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
