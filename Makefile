@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 # As nice as the helpers of a service, for which they wait: those would get what is left over.
 # One thread for matrix products: two, beside other processes, wait for each other in a loop and take up to four times the processor time.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
+# A test that hangs ends its process, which tells the stacks of its threads; another process goes on with the tests.
+BOUNDED := -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true
 KERNEL_SOURCES := $(wildcard model/kernels/* model/library/*) CMakeLists.txt
 PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
@@ -48,10 +50,10 @@ browser: $(BROWSER)  ## build @ultragray/web, and the page that `ultragray expor
 
 test: $(VENV)/collected  ## set up, then run the tests in random order (ARGS="-k probe" for some, ARGS="--randomly-seed=N" for an order again)
 	@$(CONSOLE_IF_POSSIBLE)
-	$(PYTEST) -m "not long" $(ARGS)
+	$(PYTEST) $(BOUNDED) -m "not long" $(ARGS)
 
 test-fast: $(VENV)/collected  ## those that take a minute together, for while one works: without processes of their own
-	$(PYTEST) -m "not slow and not long" $(ARGS)
+	$(PYTEST) $(BOUNDED) -m "not slow and not long" $(ARGS)
 
 test-long: $(VENV)/collected  ## those that make test leaves out (RECORD=1: what came of it to tests/long-run.json)
 	$(READY)

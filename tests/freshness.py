@@ -20,8 +20,12 @@ class Door(Protocol):
         """Takes a frame; the number of its pose."""
 
 
-def check_fresh(door):
-    """Each frame is of the newest pose of when the reader took the one before it, or of a newer one."""
+def check_fresh(door, *, excused=0):
+    """Each frame is of the newest pose of when the reader took the one before it, or of a newer one.
+
+    `excused`: so many may be older, where only the window of the reader's kernel tells what was read. That kernel may
+    widen its window on its own: one of 130 connections on a busy machine has a frame sent ahead for it.
+    """
     sent, before, old = 0, 0, {}
     for reading, count in enumerate(POSES):
         for _ in range(count):
@@ -31,4 +35,6 @@ def check_fresh(door):
         if number < before:
             old[reading] = number, before
         before = sent
-    assert not old, f"by reading: the pose of its frame, and the newest that was there at the reading before: {old}"
+    assert len(old) <= excused, (
+        f"by reading: the pose of its frame, and the newest that was there at the reading before: {old}"
+    )

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.files import file_sha256
@@ -69,6 +70,13 @@ class SceneStore:
         reference, shelf = self._found(text)
         try:
             return shelf.fetch(reference.name)
+        except FileNotFoundError:
+            raise self._not_found(text) from None
+
+    def open(self, text: str) -> BinaryIO:
+        """The file of a scene, to be read as it is now, whatever takes its name meanwhile; raises as `path`."""
+        try:
+            return self.path(text).open("rb")
         except FileNotFoundError:
             raise self._not_found(text) from None
 

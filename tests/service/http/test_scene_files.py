@@ -1,5 +1,6 @@
 """Scene files over HTTP: looked into, downloaded, imported, deleted."""
 
+import asyncio
 import hashlib
 import json
 import socket
@@ -12,6 +13,7 @@ from safetensors.numpy import load, save
 
 from ultragray import GaussianScene, read_header
 from ultragray_service.core.scene_points import even_selection
+from ultragray_service.http.routes.scenes import OpenFileResponse
 
 from ...waiting import wait_until
 from ...warm import Hold
@@ -239,6 +241,22 @@ def test_corrected_training_poses(http):
     told = http.get("/v1/scenes/corrected/training-poses").json()
     assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
     http.delete("/v1/scenes/corrected")
+
+
+def test_a_download_is_of_one_version_whatever_takes_its_name(tmp_path):
+    """A scene that grows gets a new version after the length of the one before was told."""
+    path, newer = tmp_path / "liver.ugr", tmp_path / "newer.ugr"
+    path.write_bytes(b"the version that was asked for")
+    response = OpenFileResponse(path.open("rb"), filename="liver.ugr")
+    newer.write_bytes(b"a shorter one")
+    newer.replace(path)
+
+    async def get():
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(response), base_url="http://test") as client:
+            return await client.get("/")
+
+    answer = asyncio.run(get())
+    assert (answer.content, answer.headers["content-length"]) == (b"the version that was asked for", "30")
 
 
 def test_a_scene_is_handed_out_compressed_once_made(http, demo_scene, artifacts, tmp_path):

@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import os
 import time
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument
@@ -269,12 +271,25 @@ async def get_thumbnail(request: Request, service: ServiceDep, scene: SceneName)
     return await revalidated(request, f"{key}-thumbnail", partial(service.thumbnails.png, scene, key), PNG)
 
 
+class OpenFileResponse(FileResponse):
+    """A file that is open already: one version of it, whatever takes its name while a client reads."""
+
+    def __init__(self, file: BinaryIO, *, filename: str) -> None:
+        self._file = file
+        path, status = f"/dev/fd/{file.fileno()}", os.fstat(file.fileno())
+        super().__init__(path, media_type=RAW, filename=filename, stat_result=status)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self._file:
+            await super().__call__(scope, receive, send)
+
+
 @router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     header = await service.catalog.header(scene)
-    path = await asyncio.to_thread(service.scene_store.path, scene)
-    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIXES[header.is_compressed]}")
+    file = await asyncio.to_thread(service.scene_store.open, scene)
+    return OpenFileResponse(file, filename=f"{base_name(scene)}{SUFFIXES[header.is_compressed]}")
 
 
 @router.get(
