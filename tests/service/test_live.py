@@ -10,6 +10,7 @@ import threading
 import httpx
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
 from ultragray_client import Client, LiveJob, RealFrame, RecordingSettings, errors
@@ -161,6 +162,22 @@ def test_a_service_that_is_killed_between_frames_loses_none_that_it_acknowledged
         start_service(artifact_folder=tmp_path, cold=True, grpc_port=port)
         go_on.set()
         assert list(answers)[-1].recording.frames == 8
+
+
+def test_who_records_is_told_of_a_failure_that_nobody_foresaw(service, http, client, begun, artifacts):
+    """A file has come to stand where the blocks of the recording belong."""
+    list(client.recordings.record(begun, map(frame_of, range(2))))
+    header = json.loads((artifacts / "recordings" / f"{begun}.json").read_text())
+    blocks = artifacts / "recording-blocks" / header["id"]
+    blocks.rename(blocks.with_name("elsewhere"))
+    blocks.touch()
+    with pytest.raises(errors.ClientError, match="INTERNAL"):
+        list(client.recordings.record(begun, map(frame_of, range(2, 4))))
+    with connect(f"{service.http.replace('http', 'ws', 1)}/v1/recordings/{begun}/stream") as socket:
+        socket.send(message_of(4))
+        with pytest.raises(ConnectionClosedError):
+            list(socket)
+    assert post(http, begun, message_of(4)).status_code == 500
 
 
 def test_what_a_key_may_store_holds_for_recordings(start_service, tmp_path):

@@ -62,7 +62,7 @@ class RecordingStream:
         self._waiting: list[RecordedFrame] = []
         self._waiting_bytes = 0
         self._storing: asyncio.Task[None] | None = None
-        self._failure: UltragrayError | None = None
+        self._failure: Exception | None = None
         self.changed = asyncio.Event()
 
     @property
@@ -96,7 +96,7 @@ class RecordingStream:
         return self.state
 
     def require_stored(self) -> None:
-        """Raises what storing a frame has raised."""
+        """Raises what storing a frame has raised, whatever it is."""
         if self._failure is not None:
             raise self._failure
 
@@ -106,7 +106,7 @@ class RecordingStream:
                 frames, self._waiting, self._waiting_bytes = self._waiting, [], 0
                 await asyncio.to_thread(self._writer.append, frames, self._max_bytes)
                 self.changed.set()
-        except UltragrayError as error:
+        except Exception as error:  # the client, who waits for the next answer, is told
             self._failure = error
             self.changed.set()
 
@@ -155,9 +155,10 @@ async def record(
     tasks: set[asyncio.Future[Any]] = {taking, telling, stopping}
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        if stopping.done():
-            raise Draining("the service is stopping; go on when it is back")
-        (telling if telling.done() else taking).result()
+        async with sending:  # an answer that is half written is written to its end
+            if stopping.done():
+                raise Draining("the service is stopping; go on when it is back")
+            (telling if telling.done() else taking).result()
     finally:
         for task in tasks:
             task.cancel()
