@@ -118,6 +118,7 @@ def make_handler(streaming: tuple[bool, bool], method: Method, *codecs: Any) -> 
     return make(method, *codecs)
 
 
+_GONE_S = 0.5  # after which grpc has told that a caller is gone
 _OPEN_PREFIX = "/grpc.health.v1."
 OWN_PREFIX = "/ultragray."
 
@@ -195,8 +196,9 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
                 status = grpc.StatusCode.OK.name
             except asyncio.CancelledError:
                 raise
-            except grpc.aio.InternalError:  # a write: the caller is gone, which grpc tells a moment later
-                raise asyncio.CancelledError from None
+            except grpc.aio.InternalError:  # a write: the caller is gone, as a rule, which ends this wait
+                await asyncio.sleep(_GONE_S)
+                await abort(context, UltragrayError("an answer could not be sent"))
             except UltragrayError as error:
                 status = statuses_of(error).grpc
                 await abort(context, error)

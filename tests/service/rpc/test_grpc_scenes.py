@@ -123,6 +123,35 @@ def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path, caplog):
     assert (record.getMessage(), fields["method"], fields["status"]) == ("request", METHOD, "CANCELLED")
 
 
+class WritingTwice(Streaming):
+    """A call that begins a message before the one before it is written, which grpc refuses."""
+
+    async def _stream(self, request, context):
+        await asyncio.gather(*(context.write(Empty()) for _ in range(2)))
+
+
+async def answers_of(handler, folder):
+    server = grpc.aio.server(interceptors=[CallContext(make_service(load_settings(data_folder=folder)))])
+    server.add_generic_rpc_handlers([handler])
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        call = channel.unary_stream(METHOD, Empty.SerializeToString, Empty.FromString)(Empty(), timeout=60)
+        try:
+            return [answer async for answer in call]
+        finally:
+            await server.stop(5)
+
+
+def test_a_caller_that_is_there_is_told_of_a_write_that_failed(tmp_path):
+    with pytest.raises(grpc.aio.AioRpcError) as failure:
+        asyncio.run(answers_of(WritingTwice(), tmp_path))
+    assert (failure.value.code(), failure.value.details()) == (
+        grpc.StatusCode.INTERNAL,
+        "an answer could not be sent",
+    )
+
+
 class Gone:
     """A context as grpc leaves it for a moment when the caller's deadline passes: it cannot be provoked at will."""
 
