@@ -404,17 +404,21 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         by_mean[d] = by_place[d] + convert(harmonics.mean[d]);
     }
 
+    Floats by_rest[3] = {to_floats(by_mean[0]), to_floats(by_mean[1]), to_floats(by_mean[2])};
+    if constexpr (displaced) {
+        Doubles mean[3]{};
+        Floats by_f[3][3];
+        for (int d = 0; d < 3; ++d) {
+            for (int k = 0; k < c.count; ++k) mean[d][k] = scene.gaussians[c.ids[k]].mean[d];
+            for (int e = 0; e < 3; ++e) by_f[d][e] = to_floats(by_map[d][e]);
+        }
+        differentiate_displacement(view, c.count, mean, by_rest, by_f, by_fields);
+    }
+
     const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
     for (int k = 0; k < c.count; ++k) {
-        float by_rest[3] = {float(by_mean[0][k]), float(by_mean[1][k]), float(by_mean[2][k])};
-        if constexpr (displaced) {
-            float by_lane[3][3];
-            for (int d = 0; d < 3; ++d)
-                for (int e = 0; e < 3; ++e) by_lane[d][e] = float(by_map[d][e][k]);
-            differentiate_displacement(view, scene.gaussians[c.ids[k]].mean, by_rest, by_lane, by_fields);
-        }
         GaussianGradient& to = gradients[c.ids[k]];
-        for (int d = 0; d < 3; ++d) to.mean[d] += by_rest[d], to.log_scale[d] += float(by_log_scale[d][k]);
+        for (int d = 0; d < 3; ++d) to.mean[d] += by_rest[d][k], to.log_scale[d] += float(by_log_scale[d][k]);
         for (int d = 0; d < 4; ++d) to.quat[d] += float(by_quat[d][k]);
         to.absorb += scene.weighted ? -2.0f * by.m2_plane[k] : by.absorb[k];
         float* sh = sh_gradients + c.ids[k] * terms;

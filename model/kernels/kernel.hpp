@@ -52,13 +52,25 @@ struct Beam {
 
 inline constexpr int kMaxFields = 4;  // one after another
 
+// Bounds of a field along elevation, for coordinates of the grid's third axis from one whole number to the next.
+struct Layer {
+    float least, most;        // displacement, cm
+    float gradient, stretch;  // the norms of its gradient, and of FT n, by which Gaussians reach farther
+    void widen(const Layer& other) {
+        least = other.least < least ? other.least : least, most = other.most > most ? other.most : most;
+        gradient = other.gradient > gradient ? other.gradient : gradient;
+        stretch = other.stretch > stretch ? other.stretch : stretch;
+    }
+};
+
 // A smooth displacement of tissue: at grid coordinates g = to_grid (x, 1) the sum of coefficients times the cubic B-splines
 // around their places; beyond the outermost cells (1 to size - 2) as at the border.
 struct Field {
     const float* coefficients;  // [X, Y, Z, 4] cm along the scene's axes, and 0
     double to_grid[3][4];
-    int size[3];     // each at least 4
-    float steepest;  // bound of the norm of its gradient
+    int size[3];          // each at least 4
+    const Layer* layers;  // [Z - 3]
+    float steepest;       // 1 + bound of the norm of its gradient; of the last field of a view, 1
     int64_t place(int i, int j, int k) const { return 4 * ((int64_t(i) * size[1] + j) * size[2] + k); }
     const float* at(int i, int j, int k) const { return coefficients + place(i, j, k); }
 };
@@ -86,8 +98,7 @@ struct View {
     Beam beam;
     const Field* fields;  // by which Gaussians are displaced, one after another
     int field_count;
-    float stretch;                  // bound of how much farther two points come apart by them
-    float least_moved, most_moved;  // bounds of the displacement along elevation, cm
+    Layer displaced;  // bounds of all of them
 };
 
 // A Gaussian cut by the image plane: a 2D Gaussian there, and what it adds.

@@ -77,52 +77,96 @@ class Fields {
             for (const Displacement& one : displacements) add(one, first + c);
     }
 
-    // Of how far tissue comes apart, only what is along elevation decides which Gaussians the plane may cut: a mean's
-    // distance from it, and Fᵀ n for the reach. Of the last field that is the slope of one component, of those before it of
-    // all.
-    void apply(View& view, int c) const {
+    // Only the displacement along elevation decides which Gaussians the plane may cut. Of the last field that is one
+    // component; of those before it all count, as they choose where the last one is looked up.
+    void apply(View& view, int c) {
         view.fields = fields_.data() + int64_t(c) * each_;
         view.field_count = each_;
-        double stretched = 1, least = 0, most = 0;
-        std::vector<float> along;
+        float steepest = 1;
         for (int f = 0; f < each_; ++f) {
-            const Field& field = view.fields[f];
-            along.assign(int64_t(field.size[0]) * field.size[1] * field.size[2], 0.0f);
-            for (size_t i = 0; i < along.size(); ++i)
-                for (int d = 0; d < 3; ++d) along[i] += float(view.axes[1][d]) * field.coefficients[4 * i + d];
-            const auto [low, high] = std::minmax_element(along.begin(), along.end());
-            least += *low, most += *high;
-            stretched *= 1 + (f + 1 < each_ ? field.steepest : steepest(field, along.data(), 1, 1));
+            Field& field = fields_[int64_t(c) * each_ + f];
+            layers_.push_back(layers_of(field, view.axes[1]));
+            field.layers = layers_.back().data();
+            field.steepest = f + 1 < each_ ? 1 + steepest_of(field) : 1;
+            Layer all = field.layers[0];
+            for (const Layer& one : layers_.back()) all.widen(one);
+            view.displaced.least += all.least, view.displaced.most += all.most;
+            view.displaced.gradient = steepest * (1 + all.gradient) - 1;
+            view.displaced.stretch = steepest * all.stretch;
+            steepest *= field.steepest;
         }
-        const double slack = 1e-5 * (most - least);
-        view.stretch = static_cast<float>((stretched - 1) * (1 + 1e-5));
-        view.least_moved = static_cast<float>(least - slack), view.most_moved = static_cast<float>(most + slack);
     }
 
     int each() const { return each_; }
 
  private:
-    // Bound of the norm of the gradient of some components at the nodes of a field, [X, Y, Z, stride]: between neighbours
-    // along an axis of the grid a spline's slope is a mean of their differences.
-    static float steepest(const Field& field, const float* nodes, int stride, int components) {
+    static constexpr float kRounding = 1 + 1e-5f;
+
+    // Values of a spline are means of its four nodes along each axis, and its slopes of the differences of neighbours. The
+    // axes of the grid are at right angles.
+    static std::vector<Layer> layers_of(const Field& field, const double normal[3]) {
+        const int depths = field.size[2];
+        const int64_t columns = int64_t(field.size[0]) * field.size[1];
+        std::vector<float> along(columns * depths);
+        for (size_t i = 0; i < along.size(); ++i) {
+            const float* node = field.coefficients + 4 * i;
+            along[i] = float(normal[0]) * node[0] + float(normal[1]) * node[1] + float(normal[2]) * node[2];
+        }
+        std::vector<float> low(along.begin(), along.begin() + depths), high = low, steps[3];
+        for (std::vector<float>& one : steps) one.assign(depths, 0.0f);
+        const auto widen = [](std::vector<float>& most, const float* from, const float* to, int count) {
+            for (int k = 0; k < count; ++k) {
+                const float step = to[k] - from[k], square = step * step;
+                most[k] = square > most[k] ? square : most[k];
+            }
+        };
+        for (int64_t column = 0; column < columns; ++column) {
+            const float* here = &along[column * depths];
+            for (int k = 0; k < depths; ++k) {
+                low[k] = here[k] < low[k] ? here[k] : low[k];
+                high[k] = here[k] > high[k] ? here[k] : high[k];
+            }
+            if (column + field.size[1] < columns) widen(steps[0], here, here + field.size[1] * depths, depths);
+            if ((column + 1) % field.size[1]) widen(steps[1], here, here + depths, depths);
+            widen(steps[2], here, here + 1, depths - 1);
+        }
+        std::vector<Layer> layers(depths - 3);
+        for (int k = 0; k < depths - 3; ++k) {
+            Layer& layer = layers[k];
+            layer.least = *std::min_element(&low[k], &low[k] + 4), layer.most = *std::max_element(&high[k], &high[k] + 4);
+            double gradient = 0, stretch = 0;
+            for (int a = 0; a < 3; ++a) {
+                const double* row = field.to_grid[a];
+                const double per_cm = std::sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]);
+                const double facing = std::abs(row[0] * normal[0] + row[1] * normal[1] + row[2] * normal[2]) / per_cm;
+                const double slope = per_cm * std::sqrt(*std::max_element(&steps[a][k], &steps[a][k] + (a == 2 ? 3 : 4)));
+                gradient += slope * slope, stretch += (facing + slope) * (facing + slope);
+            }
+            layer.gradient = float(std::sqrt(gradient)) * kRounding, layer.stretch = float(std::sqrt(stretch)) * kRounding;
+        }
+        return layers;
+    }
+
+    // Bound of the norm of a field's gradient.
+    static float steepest_of(const Field& field) {
         double squares = 0;
         for (int a = 0; a < 3; ++a) {
             float longest = 0;
             double per_cm = 0;
             for (int e = 0; e < 3; ++e) per_cm += field.to_grid[a][e] * field.to_grid[a][e];
             const int end[3] = {field.size[0] - (a == 0), field.size[1] - (a == 1), field.size[2] - (a == 2)};
-            const int64_t next = stride * (field.place(a == 0, a == 1, a == 2) / 4);
+            const int64_t next = field.place(a == 0, a == 1, a == 2);
             for (int i = 0; i < end[0]; ++i)
                 for (int j = 0; j < end[1]; ++j)
                     for (int k = 0; k < end[2]; ++k) {
-                        const float* here = nodes + stride * (field.place(i, j, k) / 4);
+                        const float* here = field.at(i, j, k);
                         float step = 0;
-                        for (int d = 0; d < components; ++d) step += (here[next + d] - here[d]) * (here[next + d] - here[d]);
+                        for (int d = 0; d < 3; ++d) step += (here[next + d] - here[d]) * (here[next + d] - here[d]);
                         longest = std::max(longest, step);
                     }
             squares += longest * per_cm;
         }
-        return static_cast<float>(std::sqrt(squares) * (1 + 1e-5));
+        return float(std::sqrt(squares)) * kRounding;
     }
 
     void add(const Displacement& one, int pose) {
@@ -134,14 +178,14 @@ class Fields {
         const float* from = one.coefficients + (one.has_many ? floats * pose : 0);
         for (int64_t i = 0; i < floats / 3; ++i) std::copy_n(from + 3 * i, 3, &packed[4 * i]);
         field.coefficients = packed.data();
-        field.steepest = steepest(field, packed.data(), 4, 3);
         packed_.push_back(std::move(packed));
         fields_.push_back(field);
     }
 
     int each_;  // of a pose
     std::vector<std::vector<float>> packed_;
-    std::vector<Field> fields_;  // [poses, each]
+    std::vector<Field> fields_;               // [poses, each]
+    std::vector<std::vector<Layer>> layers_;  // likewise
 };
 
 // One allocation of the four accumulators of a strip.
@@ -339,7 +383,7 @@ class Batch {
     const Kernels& kernels_;
     const SceneView scene_;
     const ScanLines lines_;
-    const Fields fields_;
+    Fields fields_;
     std::vector<View> views_;
     std::vector<SliceList> slices_;  // [poses, parts]
 };

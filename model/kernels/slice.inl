@@ -126,17 +126,15 @@ inline Placed<Reals> place(const SceneView& scene, const View& view, const Candi
     const auto convert = [](auto vector) { return __builtin_convertvector(vector, Reals); };
     Placed<Reals> p;
     Doubles offset[3];  // a small difference of large numbers, and so are the mean's places
-    for (int d = 0; d < 3; ++d) offset[d] = __builtin_convertvector(load<Floats>(mean[d]), Doubles) - view.origin[d];
-    if constexpr (displaced)
-        for (int k = 0; k < kLanes; ++k) {
-            double x[3] = {mean[0][k], mean[1][k], mean[2][k]};
-            float map[3][3];
-            displace(view, x, map);
-            for (int d = 0; d < 3; ++d) {
-                offset[d][k] = x[d] - view.origin[d];
-                for (int e = 0; e < 3; ++e) p.map[d][e][k] = map[d][e];
-            }
-        }
+    for (int d = 0; d < 3; ++d) offset[d] = __builtin_convertvector(load<Floats>(mean[d]), Doubles);
+    if constexpr (displaced) {
+        Floats map[3][3];
+        set_identity(map);
+        for (int f = 0; f < view.field_count; ++f) displace_by(view.fields[f], c.count, offset, map);
+        for (int d = 0; d < 3; ++d)
+            for (int e = 0; e < 3; ++e) p.map[d][e] = convert(map[d][e]);
+    }
+    for (int d = 0; d < 3; ++d) offset[d] -= view.origin[d];
     for (int d = 0; d < 3; ++d) p.offset[d] = convert(offset[d]);
     for (int d = 0; d < 3; ++d)
         p.mu[d] = convert(view.axes[d][0] * offset[0] + view.axes[d][1] * offset[1] + view.axes[d][2] * offset[2]);
@@ -263,6 +261,45 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     out.shrink_by(room - written);
 }
 
+// Bounds of a field within so much of a point.
+inline Layer layer_about(const Field& field, const Doubles point[3], float radius) {
+    const double* row = field.to_grid[2];
+    const double at = row[0] * point[0][0] + row[1] * point[1][0] + row[2] * point[2][0] + row[3];
+    const double room = radius * __builtin_sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]);
+    const auto cell = [most = field.size[2] - 4](double coordinate) {
+        return coordinate < 2 ? 0 : coordinate < most + 1 ? static_cast<int>(coordinate) - 1 : most;
+    };
+    Layer layer = field.layers[cell(at - room)];
+    for (int k = cell(at - room) + 1; k <= cell(at + room); ++k) layer.widen(field.layers[k]);
+    return layer;
+}
+
+// Of the displacement of a cluster's means: the centre's tells it to first order.
+inline Layer displacement_of(const View& view, const Cluster& cluster) {
+    Doubles x[3];
+    float squares = 0, steepest = 1, moved = 0;
+    for (int d = 0; d < 3; ++d) {
+        x[d] = splat_double(cluster.centre[d]);
+        squares += cluster.half[d] * cluster.half[d];
+    }
+    const float radius = __builtin_sqrtf(squares);
+    Layer all{};
+    for (int f = 0; f < view.field_count; ++f) {
+        const Layer layer = layer_about(view.fields[f], x, steepest * radius);
+        all.least += layer.least, all.most += layer.most;
+        all.gradient = steepest * (1 + layer.gradient) - 1, all.stretch = steepest * layer.stretch;
+        steepest *= view.fields[f].steepest;
+        Fielded at;
+        field_at(view.fields[f], x, 1, at);
+        move(x, at);
+    }
+    for (int d = 0; d < 3; ++d) moved += float(view.axes[1][d]) * static_cast<float>(x[d][0] - cluster.centre[d]);
+    const float room = all.gradient * radius;
+    all.least = all.least < moved - room ? moved - room : all.least;
+    all.most = moved + room < all.most ? moved + room : all.most;
+    return all;
+}
+
 template <bool thick, bool displaced>
 void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
     const float ny[3] = {float(view.axes[1][0]), float(view.axes[1][1]), float(view.axes[1][2])};
@@ -272,39 +309,37 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
     const float slack = 1e-6f * (1.0f + far + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
     // A reach of 3.33 standard deviations; variances add up.
     const float beam_reach2 = float(kMaxM2 * (1 + 1e-5) * view.beam.most);
-    const auto reach_of = [beam_reach2, &view](float reach) {
-        if constexpr (displaced) reach *= 1 + view.stretch;
+    const auto reach_of = [beam_reach2](float reach) {
         return thick ? __builtin_sqrtf(reach * reach + beam_reach2) : reach;
     };
     Candidates found;
     for (int64_t i = first; i < last; ++i) {
         const Cluster& cluster = scene.clusters[i];
-        float distance = 0, extent = slack + reach_of(cluster.reach);
+        float distance = 0, extent = slack;
         for (int d = 0; d < 3; ++d) {
             distance += ny[d] * (cluster.centre[d] - o[d]);
             extent += __builtin_fabsf(ny[d]) * cluster.half[d];
         }
-        float moved = 0, doubt = 0;  // of all its Gaussians along elevation
+        Layer moved{0, 0, 0, 1};
+        const auto is_off = [&] {
+            const float all = extent + reach_of(moved.stretch * cluster.reach);
+            return distance + moved.most < -all || distance + moved.least > all;
+        };
         if constexpr (displaced) {
-            if (distance + view.most_moved < -extent || distance + view.least_moved > extent) continue;
-            double x[3] = {cluster.centre[0], cluster.centre[1], cluster.centre[2]};
-            float map[3][3], squares = 0;
-            displace(view, x, map);
-            for (int d = 0; d < 3; ++d) {
-                moved += ny[d] * static_cast<float>(x[d] - cluster.centre[d]);
-                squares += cluster.half[d] * cluster.half[d];
-            }
-            doubt = view.stretch * __builtin_sqrtf(squares);
+            moved = view.displaced;
+            if (is_off()) continue;
+            moved = displacement_of(view, cluster);
         }
-        if (__builtin_fabsf(distance + moved) > extent + doubt) continue;
+        if (is_off()) continue;
+        const float middle = 0.5f * (moved.least + moved.most), doubt = slack + 0.5f * (moved.most - moved.least);
         const int64_t begin = i * kClusterSize;
         const int64_t end = begin + kClusterSize < scene.count ? begin + kClusterSize : scene.count;
         for (int64_t g = begin; g < end; ++g) {
             const Gaussian& gaussian = scene.gaussians[g];
-            float height = 0;
+            float height = middle;
             for (int d = 0; d < 3; ++d) height += ny[d] * (gaussian.mean[d] - o[d]);
             found.ids[found.count] = g;
-            found.count += __builtin_fabsf(height + moved) <= reach_of(gaussian.reach) + slack + doubt;
+            found.count += __builtin_fabsf(height) <= reach_of(moved.stretch * gaussian.reach) + doubt;
             if (found.count == kLanes) {
                 slice_candidates<thick, displaced>(scene, view, found, out);
                 found.count = 0;
