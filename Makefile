@@ -35,7 +35,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing motion from-labels confidence speckle prediction preview planning pressing live environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console browser test test-fast test-long test-notebooks test-console test-browser test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console bench-browser console-picture bench-cuda results methods ablations poses hand localization compressed editing motion from-labels confidence speckle prediction preview planning policy pressing live environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -257,17 +257,23 @@ preview: $(VENV)/installed-dev  ## what an operator sees while real frames come 
 	@$(BIN)/python benchmarks/figures.py show preview
 	$(KEEP) preview
 
-live: $(VENV)/installed-dev  ## how soon a scene shows what is being scanned, and how well in the end, beside `fast`; half an hour
+live: $(VENV)/installed-dev  ## how soon a scene shows what is being scanned, and how well in the end, beside `fast`; ten minutes
 	$(READY)
 	$(BIN)/python benchmarks/live.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show live
 	$(KEEP) live
 
-planning: $(VENV)/installed-dev  ## half the frames, planned, against an even raster of the phantom, over ten seeds, and the time of a plan; takes half an hour
+planning: $(VENV)/installed-dev  ## half the frames, planned, against an even raster of the phantom, over ten seeds, and the time of a plan; takes ten minutes
 	$(READY)
 	$(BIN)/python benchmarks/planning.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show planning
 	$(KEEP) planning
+
+policy: $(VENV)/installed-dev  ## how often a policy that imitates a teacher finds the standard plane; learns twice, ten minutes
+	$(READY)
+	$(BIN)/python benchmarks/policy.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show policy
+	$(KEEP) policy
 
 pressing: $(VENV)/installed-dev  ## how tissue gives way to a face beside finite elements of layers, and what it costs; takes a minute
 	$(READY)

@@ -34,6 +34,7 @@ import measuring
 import methods_tables
 import motion
 import planning
+import policy
 import poses
 import prediction
 import pressing
@@ -59,7 +60,7 @@ TARGETS = {
         name: name
         for name in (
             *("ablations", "poses", "hand", "localization", "confidence"),
-            *("speckle", "environment", "prediction", "preview", "live", "planning", "pressing", "ros"),
+            *("speckle", "environment", "prediction", "preview", "live", "planning", "policy", "pressing", "ros"),
         )
     },
     "compressed": "compressed",
@@ -388,6 +389,7 @@ BLOCKS = {
     "displacement under a face": Block("pressing", pressing.displacements),
     "cost of pressing": Block("pressing", pressing.cost_of_pressing),
     "planned views": Block("planning", planning.planned_and_even),
+    "policies": Block("policy", policy.reached_planes),
     "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
     "results": Block("results_tables", results_tables.results),
     "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),
@@ -420,7 +422,9 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 
     def block(place: re.Match[str]) -> str:
         one = BLOCKS[place[1]]
-        lines = [*one.of(read_kept(one.source)), ""]
+        if not (figures := read_kept(one.source)):
+            return f"{place[1]}{place[2]}Not measured yet: `make {TARGETS[one.source]} RECORD=1`.\n"
+        lines = [*one.of(figures), ""]
         lines[-2] = f"`{kept(one.source).relative_to(measuring.ROOT)}`: {lines[-2]}"
         return f"{place[1]}{place[2]}" + "\n".join(lines)
 

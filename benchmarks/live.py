@@ -194,4 +194,4 @@ def live_scenes(document: Document) -> Lines:
 
 
 if __name__ == "__main__":
-    measure_runs("live", __doc__, {name: partial(run, name) for name in SETS}, threads=1)
+    measure_runs("live", __doc__, {name: partial(run, name) for name in SETS}, threads=1, at_once=2)

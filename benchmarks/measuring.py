@@ -7,10 +7,14 @@ figures.py records what is left here in build/bench.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import logging
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -46,18 +50,19 @@ def read(path: Path) -> Document:
 
 def write(name: str, document: Document) -> None:
     """Leave a file of figures to be recorded."""
-    staged(name).parent.mkdir(parents=True, exist_ok=True)
+    STAGE.mkdir(parents=True, exist_ok=True)
     write_whole(staged(name), json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 Run = Callable[[Path], Document]  # measures one run, given the folder of the data sets
 
 
-def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threads: int = 0) -> None:
+def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threads: int = 0, at_once: int = 1) -> None:
     """The program of a file that is measured run by run: `DATA_FOLDER [--only NAME ...]`.
 
     A run's figures are written as soon as it is done, and it is not repeated at the same commit: a killed program goes
-    on. `threads`: 0 for all cores.
+    on. `threads`: 0 for all cores. `at_once`: runs that are measured beside each other, by a program each; for figures
+    that do not tell how busy the machine is.
     """
     parser = argparse.ArgumentParser(description=(about or "").partition("\n")[0])
     parser.add_argument("data_folder", type=Path, help="folder of the data sets")
@@ -66,15 +71,23 @@ def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threa
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if threads:
         torch.set_num_threads(threads)
-    for run, take in runs.items():
-        if given.only is None or run.startswith(tuple(given.only)):
-            head = measured(torch.get_num_threads())
-            known = read(staged(name)).get(run)
-            if known is not None and known["measured"]["commit"] == head["commit"] and not is_dirty(head):
-                continue
-            log.info("%s", run)
-            figures = {**take(given.data_folder), "measured": head}
-            write(name, {**read(staged(name)), run: figures})  # read anew: another program may have measured others
+    wanted = [run for run in runs if given.only is None or run.startswith(tuple(given.only))]
+    if min(at_once, len(wanted)) > 1:
+        program = [sys.executable, sys.argv[0], str(given.data_folder), "--only"]
+        with ThreadPoolExecutor(at_once) as pool:
+            list(pool.map(lambda run: subprocess.run([*program, run], check=True), wanted))
+        return
+    for run in wanted:
+        head = measured(torch.get_num_threads())
+        known = read(staged(name)).get(run)
+        if known is not None and known["measured"]["commit"] == head["commit"] and not is_dirty(head):
+            continue
+        log.info("%s", run)
+        figures = {**runs[run](given.data_folder), "measured": head}
+        STAGE.mkdir(parents=True, exist_ok=True)
+        with staged(name).with_suffix(".lock").open("w") as lock:  # another program may write what it has measured
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            write(name, {**read(staged(name)), run: figures})
 
 
 def is_dirty(head: Document) -> bool:

@@ -35,7 +35,7 @@ FRAMES = 36  # of a raster
 ROUNDS = (6, 12)  # frames: the first are even, the others planned by the scene of those before
 WITHIN_MM = 2.0  # of coverage: about half the spacing of an even raster of half the frames
 TRAINING = TrainingConfig(steps=100, max_gaussians=2500, refine_poses="none", confidence=False)
-UNSEEN = 12
+UNSEEN = 40
 SEEDS = 10
 TIMED_VIEWS = 50
 
@@ -141,4 +141,4 @@ def planned_and_even(runs: Document) -> Lines:
 RUNS = {"time": timed, **{f"seed {seed}": partial(measure, seed) for seed in range(SEEDS)}}
 
 if __name__ == "__main__":
-    measure_runs("planning", __doc__, RUNS, threads=1)
+    measure_runs("planning", __doc__, RUNS, threads=1, at_once=2)

@@ -96,3 +96,8 @@ def test_every_place_has_its_block_and_every_block_its_place():
     text = "".join(page.read_text(encoding="utf-8") for page in figures.documents())
     assert {name for name in figures.BLOCKS if f"<!-- measured: {name} -->\n" not in text} == set()
     assert figures.current(text), "a place without a block is a KeyError"
+
+
+def test_a_place_whose_file_is_not_there_says_how_it_is_measured():
+    text = figures.current("<!-- measured: policies -->\n<!-- end -->", lambda name: {})
+    assert text == "<!-- measured: policies -->\nNot measured yet: `make policy RECORD=1`.\n<!-- end -->"

@@ -1,5 +1,11 @@
 """What `make results`, `methods` and `ablations` measure, and the tables that come of it."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -16,9 +22,23 @@ from ..model.learn.training.test_agreement import FRAMES, hand_path, recording
 from ..model.learn.training.test_poses import PROBE
 from ..scripts import benchmark
 
-results, methods, ablations, localization = map(
-    benchmark, ("results_tables", "methods_tables", "ablations", "localization")
+results, methods, ablations, localization, policy = map(
+    benchmark, ("results_tables", "methods_tables", "ablations", "localization", "policy")
 )
+BESIDE = """
+from pathlib import Path
+import measuring
+
+meeting = Path(__file__).with_name("meeting")
+measuring.STAGE = Path(__file__).parent
+
+def meet(way):
+    with open(meeting, way):  # waits for the other
+        return {"way": way}
+
+if __name__ == "__main__":
+    measuring.measure_runs("pair", None, {way: lambda _, way=way: meet(way) for way in "rw"}, at_once=2)
+"""
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
@@ -76,3 +96,20 @@ def test_frames_that_were_found_are_judged_by_the_true_poses_too():
     *_, row = localization.found_frames({"phantom": run})
     assert row.startswith("| phantom | 1 | 0%: ")
     assert "° |  | 100%: 0.0" in row
+
+
+def test_runs_are_measured_beside_each_other_into_one_file(tmp_path):
+    """Each of two waits until the other is there."""
+    program = tmp_path / "pair.py"
+    program.write_text(BESIDE)
+    os.mkfifo(tmp_path / "meeting")
+    environment = {**os.environ, "PYTHONPATH": str(Path(results.__file__).parent)}
+    subprocess.run([sys.executable, program, tmp_path], env=environment, timeout=600, check=True)
+    measured = json.loads((tmp_path / "pair.json").read_text())
+    assert {run: of["way"] for run, of in measured.items()} == {"r": "r", "w": "w"}
+
+
+def test_what_policies_reached_is_a_row_for_each():
+    found = {"starts": 200, "learned_s": 100.0, "reached": 0.925, "steps": 9.0, "confidence": 0.5}
+    *_, row = policy.reached_planes({"frames alone": found})
+    assert row == "| frames alone | 200 | 92% | 9 | 0.50 | 100 s |"
