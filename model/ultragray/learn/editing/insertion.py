@@ -45,12 +45,14 @@ _SPACING = 1.2  # of Gaussians, in their deviations: nine lie over each point
 _LARGEST = 4  # times those at the surface: deviations in the depth of a body
 _FLATNESS_MM = 0.15  # by which the surface may bend away from a plane within a Gaussian that it clips
 _DARK, _LEVEL, _ROUGHNESS = 0.1, 0.3, 0.1  # least level that attenuation is reckoned from; both where nothing is near
-_NEAR_MM = 2.0  # at least as far counts as around
+_NEAR_MM, _BESIDE_MM = 2.0, 1.75  # at least as far counts as around; so far coverage is kept
 _SHARP, _SOFT = 2.5, 1.2  # of the body at its surface, and of what is around: the body outweighs it there
 _WALL = "tendon"
 _GRAIN = 3.0  # deviations of intensities over that of their mean: nine Gaussians lie over each point
+_EVEN_MM = 1.0  # side of the cubes over which texture evens out
 _TRIAL, _LINES = 0.05, 64  # 1 − τ, scan lines and samples by which attenuation is measured
 _SAMPLES = 40  # on the longer side of the box in which echo is measured
+_FIRST_RESIZED, _MOST_RESIZED, _STEPS = -0.05, 0.3, 2  # by which halves are fitted; of the logarithm of their lengths
 _TRIES = 200
 _LEAST_NEAR = 20  # Gaussians about a place where something may be inserted
 _CALCIFICATION = 1.0 / 3.0  # of the radii of other lesions
@@ -81,22 +83,24 @@ def _inserted(
             f"label must be new, or that of what was inserted before: {edit.label_name!r} was recorded", field="label"
         )
     radius = 0.5 * float((bounds[1] - bounds[0]).min())
-    level, roughness = _around(scene, distance, bounds, max(_NEAR_MM, radius))
-    longest_mm = max(FINEST_MM, math.sqrt(2.0 * _FLATNESS_MM * radius))
-    outside = clipped(split(scene, distance, radius, longest_mm), lambda points: -distance(points), _SOFT)
+    around = _Around(distance, bounds, max(_NEAR_MM, radius))
+    level, roughness = around.echo(scene)
+    outside = clipped(_halved(scene, distance, radius, around), lambda points: -distance(points), _SOFT)
     body = _copied(scene, edit, distance, bounds) if edit.texture_from_mm is not None else None
     if body is None:
         sigma = min(max(radius / 6.0, FINEST_MM), COARSEST_MM, finest)
         body = _filled(scene, distance, bounds, max(sigma, 0.1), edit.seed)
         echo = np.random.default_rng(edit.seed).normal(0.0, _GRAIN * roughness, len(body.means))
-        echo -= np.average(echo, weights=body.scales.sum(dim=1).exp().cpu().double().numpy())
     else:
         echo = undirected_echo(body) - undirected_echo(body).mean()
     known = TISSUES[edit.tissue]
     echo_db = known.echo_db if edit.echo_db is None else edit.echo_db
     target = max(0.0, level + echo_db / edit.dynamic_range_db)
     spread = min(1.0, target / max(level, _DARK))  # what is dark has little texture
-    body = with_echo(body, torch.from_numpy(target + spread * np.asarray(echo)).to(body.means))
+    levels = (target + spread * np.asarray(echo)).clip(min=0.0)
+    if edit.texture_from_mm is None:
+        levels *= target / np.maximum(_local_mean(body, levels), 1e-6)
+    body = with_echo(body, torch.from_numpy(levels).to(body.means))
     attenuation = known.attenuation if edit.attenuation is None else edit.attenuation
     lost_db = 2.0 * edit.frequency_mhz * max(0.0, attenuation - SOFT_TISSUE_DB)  # dB/cm, there and back
     body = _attenuating(body, lost_db / (edit.dynamic_range_db * max(level, _DARK)), distance, bounds)
@@ -107,19 +111,52 @@ def _inserted(
     return replace(whole, info=replace(whole.info, provenance={**whole.info.provenance, "made": made}))
 
 
-def _around(
-    scene: GaussianScene, distance: Distance, bounds: tuple[FloatArray, FloatArray], near_mm: float
-) -> tuple[float, float]:
-    """Mean and deviation of the echo beside a surface, outside it, where Gaussians support it."""
-    low, high = bounds[0] - near_mm, bounds[1] + near_mm
-    grid = VolumeGrid.over_box(low.tolist(), high.tolist(), max(0.5, float((high - low).max()) / _SAMPLES))
-    echo, coverage = (np.concatenate(list(sample_volume(scene, name, grid))).ravel() for name in ("echo", "coverage"))
-    shape = [*reversed(grid.shape)]
-    k, j, i = (axis.ravel() for axis in np.meshgrid(*map(np.arange, shape), indexing="ij"))
-    places = np.column_stack([i, j, k]) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    away = distance(places)
-    beside = echo[(away > 0.0) & (away < near_mm) & (coverage > SUPPORT_COVERAGE)]
-    return (float(beside.mean()), float(beside.std())) if len(beside) else (_LEVEL, _ROUGHNESS)
+class _Around:
+    """Places beside a surface, outside it."""
+
+    def __init__(self, distance: Distance, bounds: tuple[FloatArray, FloatArray], near_mm: float):
+        low, high = bounds[0] - near_mm, bounds[1] + near_mm
+        spacing_mm = max(0.5, float((high - low).max()) / _SAMPLES)
+        self.grid = VolumeGrid.over_box(low.tolist(), high.tolist(), spacing_mm)
+        k, j, i = (axis.ravel() for axis in np.indices([*reversed(self.grid.shape)]))
+        away = distance(np.column_stack([i, j, k]) @ self.grid.affine[:3, :3].T + self.grid.affine[:3, 3])
+        limits = near_mm, max(_BESIDE_MM, 1.5 * spacing_mm)
+        self.near, self.beside = ((away > 0.0) & (away < limit) for limit in limits)
+
+    def echo(self, scene: GaussianScene) -> tuple[float, float]:
+        """Mean and deviation where Gaussians support it."""
+        echo = self._sampled(scene, "echo")[self.near & (self._sampled(scene, "coverage") > SUPPORT_COVERAGE)]
+        return (float(echo.mean()), float(echo.std())) if len(echo) else (_LEVEL, _ROUGHNESS)
+
+    def coverage(self, scene: GaussianScene) -> float:
+        return float(self._sampled(scene, "coverage")[self.beside].mean())
+
+    def _sampled(self, scene: GaussianScene, name: str) -> FloatArray:
+        return np.concatenate(list(sample_volume(scene, name, self.grid))).ravel()
+
+
+def _halved(scene: GaussianScene, distance: Distance, radius_mm: float, around: _Around) -> GaussianScene:
+    """The scene with Gaussians that a surface may clip, covered beside it as before.
+
+    How much more halves cover than the whole did depends on what else lies there. So all of them shrink or grow alike,
+    by as much as the secant method finds.
+    """
+    halved, whole = split(scene, distance, radius_mm, max(FINEST_MM, math.sqrt(2.0 * _FLATNESS_MM * radius_mm)))
+
+    def resized(by: float) -> GaussianScene:
+        scales = halved.scales.clone()
+        scales[whole:] += by
+        return rebuilt(halved, {**halved.splats, "scales": scales}, halved.labels)
+
+    wanted = around.coverage(scene)
+    before, off_before, by = 0.0, around.coverage(halved) - wanted, _FIRST_RESIZED
+    for _ in range(_STEPS):
+        off = around.coverage(resized(by)) - wanted
+        if off == off_before:  # there are no halves
+            return halved
+        step = off * (by - before) / (off - off_before)
+        before, off_before, by = by, off, min(max(by - step, -_MOST_RESIZED), _MOST_RESIZED)
+    return resized(by)
 
 
 def _filled(
@@ -162,6 +199,14 @@ def _filled(
     if body is None:
         raise InvalidArgument("shape is too small or too thin to be filled", field="shape")
     return body
+
+
+def _local_mean(body: GaussianScene, values: FloatArray) -> FloatArray:  # [N] -> [N]
+    """Means by volume in cubes, so that no part of a body comes out brighter than another."""
+    _, cube = np.unique(np.floor(means_mm(body) / _EVEN_MM), axis=0, return_inverse=True)
+    volume = body.scales.sum(dim=1).exp().cpu().double().numpy()
+    means: FloatArray = (np.bincount(cube, volume * values) / np.bincount(cube, volume))[cube]
+    return means
 
 
 def _place_of(scene: GaussianScene) -> Any:

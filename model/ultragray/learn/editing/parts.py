@@ -185,12 +185,15 @@ def _turned_harmonics(rotation: FloatArray, degree: int) -> Tensor:  # [3, 3] ->
     return turning
 
 
-def split(scene: GaussianScene, distance: Distance, radius_mm: float, longest_mm: float) -> GaussianScene:
+def split(scene: GaussianScene, distance: Distance, radius_mm: float, longest_mm: float) -> tuple[GaussianScene, int]:
     """The scene in which Gaussians that meet a surface are no longer than `longest_mm`: they are halved, repeatedly.
+
+    With the number of those that stay whole, which come first.
 
     `radius_mm` is that by which the surface bends. A half has mean and variance of half of a normal distribution along
     the axis, and is so much thinner across it that frames are covered as before. Both halves are as transparent.
     """
+    stay = len(scene.means)
     while True:
         longest, axis = scene.scales.max(dim=1)
         long = np.flatnonzero(10.0 * longest.exp().cpu().numpy() > longest_mm)
@@ -198,7 +201,8 @@ def split(scene: GaussianScene, distance: Distance, radius_mm: float, longest_mm
             candidates = part(scene, long)
             long = long[_meets(candidates, distance, radius_mm)]
         if not len(long):
-            return scene
+            return scene, stay
+        stay -= int((long < stay).sum())
         chosen = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
         chosen[torch.from_numpy(long).to(chosen.device)] = True
         whole = part(scene, chosen)

@@ -15,7 +15,9 @@ import trimesh
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, RadialProbe, SceneInfo, render
 from ultragray.errors import InvalidArgument
 from ultragray.learn.editing.editor import digest, edit_scene
-from ultragray.learn.editing.parts import means_mm
+from ultragray.learn.editing.insertion import insert
+from ultragray.learn.editing.parts import means_mm, part
+from ultragray.phantom.demo import DEMO_PROBE, load_demo_scene
 from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import Encoding, FrameSettings
@@ -105,6 +107,22 @@ def test_two_halves_that_were_cut_merge_into_the_same_frames(scene):
     poses = scene.training_poses
     assert psnr_db(frames(merged, poses), frames(scene, poses)) > 90.0
     assert len(merged.training_poses) == 2 * len(poses)
+
+
+def test_tissue_beside_a_body_stays_as_bright_where_long_gaussians_are_halved():
+    scene = load_demo_scene()
+    edit = InsertEdit(
+        shape=EllipsoidShape(centre_mm=(-12.0, 10.0, 25.0), radii_mm=(1.2, 1.6, 1.4)), tissue="calcification", seed=1
+    )
+    scene = part(scene, np.abs(means_mm(scene)[:, 1] - 10.0) < 12.0)
+    pose = np.eye(4)
+    pose[1, 3] = 10.0
+    origins, directions = DEMO_PROBE.scan_lines(SIDE)
+    points = origins + DEMO_PROBE.depths_mm(SIDE)[:, None, None] * directions + pose[:3, 3]
+    away = edit.shape.distance_mm(points.reshape(-1, 3)).reshape(SIDE, SIDE)
+    beside = torch.from_numpy((away > 0.5) & (away < 1.5))
+    before, after = (frames(one, pose, ("echo",), DEMO_PROBE)[0][beside].mean() for one in (scene, insert(scene, edit)))
+    assert abs(float(after - before)) < 0.02
 
 
 def test_a_merged_scene_finds_its_place_and_its_gain(scene):
