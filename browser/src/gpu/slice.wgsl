@@ -149,8 +149,9 @@ fn cut(index: u32, slice: ptr<function, Slice>, extent: ptr<function, Extent>) -
     }
     low = floor(low);
     high = ceil(high);
+    var every = false; // of few lines all the way round, some are behind the origin
     if (WRAP) {
-        let every = high - low + 1.0 >= width;
+        every = high - low + 1.0 >= width;
         let turned = select(0.0, width, low < 0.0);
         low = select(low + turned, 0.0, every);
         high = select(high + turned, width - 1.0, every);
@@ -165,7 +166,7 @@ fn cut(index: u32, slice: ptr<function, Slice>, extent: ptr<function, Extent>) -
     let nearest = r - sqrt(room * rr);
     let below = select(MAX_M2, NEGLIGIBLE, opaque) - m2;
     var farthest = r + sqrt(below * rr);
-    if (FANNED) { farthest = length(vec2f(max(farthest, 0.0), abs(t) + sqrt(below * tt))); }
+    if (FANNED) { farthest = length(vec2f(abs(r) + sqrt(below * rr), abs(t) + sqrt(below * tt))); }
     if (opaque) { farthest = max(farthest, 3.0 * spread); } // where depth 0 clips the window
     let height = f32(view.height);
     let end = clamp(ceil((farthest - view.near) / view.row - 0.5), select(-1.0, 0.0, opaque), height - 1.0);
@@ -176,7 +177,7 @@ fn cut(index: u32, slice: ptr<function, Slice>, extent: ptr<function, Extent>) -
     let row = i32(clamp((r - view.near) / view.row, 0.0, height - 1.0));
     let past = view.near + view.row * (f32(row) + 0.5) - r;
     *slice = Slice(t, past, r, m2, tt, tr, rr, det, intensity(index, offset), tail.z);
-    *extent = Extent(i32(low), i32(high), i32(begin), i32(end), line, row, u32(early || nearest < 6.4 * spread));
+    *extent = Extent(i32(low), i32(high), i32(begin), i32(end), line, row, u32(early || every || nearest < 6.4 * spread));
     return true;
 }
 

@@ -48,6 +48,12 @@ CASES = {
     "radial": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL),
     "radial_about_the_centre": Case({"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.02, 0.4)}, RADIAL),
     "radial_of_few_lines": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL, width=5),
+    "radial_of_two_lines": Case(  # behind each other
+        {"count": 300, "centre_cm": (0, 0, 0), "extent_cm": (4, 1, 4), "sigma_cm": (0.02, 0.1)},
+        *(RADIAL, 80, 2),
+        tilt_deg=0.0,
+    ),
+    "radial_of_one_line": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL, width=1),
     "radial_of_many_lines": Case({"centre_cm": (0, 0, 0), "count": 600}, probe=RADIAL, width=301, poses=1),
     "steered": Case(probe=SteeredProbe(width_mm=40.0, steering_deg=25.0, near_mm=0.0, far_mm=50.0)),
     "steered_back": Case(probe=SteeredProbe(width_mm=30.0, steering_deg=-40.0, near_mm=5.0, far_mm=50.0)),

@@ -7,7 +7,6 @@ import runpy
 import struct
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from ultragray.contract import from_dict
 from ultragray.geometry.probe import ElevationBeam, Probe
 from ultragray.rendering.outputs import PLANES
 
+from ...conftest import LARGEST_FLIP
 from .test_library import Plan, Scene, library
 
 __all__ = ["library"]
@@ -28,6 +28,7 @@ SHADERS = ROOT / "browser" / "src" / "gpu"
 random_probe = runpy.run_path(str(ROOT / "tests" / "browser" / "make_frames.py"))["random_probe"]
 SCENES = int(os.environ.get("ULTRAGRAY_TEST_WEBGPU_SCENES", "12"))
 POSES = 4  # of each scene
+TWO_LINES = 214  # a seed: an image all the way round of two scan lines, each behind the other
 # As browser/src/gpu/renderer.ts has them.
 BLOCK, TILE, COLUMNS = 128, 16, 64
 SLICE_BYTES, EXTENT_BYTES, BOUNDS_BYTES = 40, 28, 20
@@ -111,13 +112,14 @@ def drawn(device, library, held, plan):
     return np.frombuffer(device.queue.read_buffer(planes), np.float32).reshape(len(PLANES), height, width)
 
 
-@pytest.mark.parametrize("seed", range(SCENES))
-def test_random_planes_are_those_of_the_reference(device, library, random_scene, random_poses, assert_agrees, seed):
+@pytest.mark.parametrize("seed", sorted({*range(SCENES), TWO_LINES}))
+def test_random_planes_are_those_of_the_reference(device, library, random_scene, random_poses, seed):
     random = np.random.default_rng(seed)
     look = {"sh_degree": int(random.integers(4)), "intensity": str(random.choice(["released", "sigmoid"]))}
     widest_cm = random.choice([0.1, 0.3, 1.0])
     scene = random_scene(int(random.integers(1, 1000)), seed=seed, sigma_cm=(0.01, widest_cm), **look)
     held = Scene(library, scene.to_bytes())
+    values, flips, largest = 0, np.zeros(len(PLANES), dtype=int), 0.0
     for pose in random_poses(POSES, seed=seed):
         height, width = (int(side) for side in random.integers(1, 90, 2))
         probe, thickness_mm = random_probe(random), float(random.choice([0.0, random.uniform(0.1, 5.0)]))
@@ -131,6 +133,12 @@ def test_random_planes_are_those_of_the_reference(device, library, random_scene,
         library.ultragray_free_view(view)
         size, beam = {"height": height, "width": width}, ElevationBeam(thickness_mm)
         exact = render(scene.to(torch.float64), from_dict(Probe, probe), pose, beam=beam, backend="reference", **size)
-        frames = SimpleNamespace(**dict(zip(PLANES, torch.from_numpy(planes.copy()), strict=True)))
-        assert_agrees(frames, {name: exact[name][0] for name in PLANES}, tolerance=5e-4)
+        apart = np.abs(planes - np.stack([exact[name][0].numpy() for name in PLANES]))
+        values += height * width
+        flips += (apart > 5e-4).sum(axis=(1, 2))
+        largest = max(largest, apart.max())
     library.ultragray_free_scene(held.pointer)
+    # Where a Gaussian just reaches 1/255 for one of the two: of small images, a single pixel may be more than a share.
+    told = f"{dict(zip(PLANES, flips, strict=True))} of {values} pixels differ, the worst by {largest:.3g}"
+    assert flips.max() <= max(1, values / 10_000), told
+    assert largest <= LARGEST_FLIP, told

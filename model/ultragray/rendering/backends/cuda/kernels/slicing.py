@@ -271,7 +271,7 @@ def slice_gaussians(
             first, last = column + (t - half) / pitch, column + (t + half) / pitch
         if WRAP:  # columns go on over the seam: from one of the frame to at most the one before it, a turn later
             first, last = tl.floor(first), tl.ceil(last)
-            every = last - first + 1.0 >= width
+            every = last - first + 1.0 >= width  # of few lines, some are behind the apex
             turned = tl.where(first < 0.0, width + 0.0, 0.0)
             first_column = tl.where(every, 0.0, first + turned).to(tl.int32)
             last_column = tl.where(every, width - 1.0, last + turned).to(tl.int32)
@@ -286,10 +286,10 @@ def slice_gaussians(
         early = opaque & (spread > EARLY_SIGMA_CM)
         top = r - tl.sqrt(tl.maximum(room * rr, 0.0))
         below = tl.where(opaque, NEGLIGIBLE, MAX_M2) - m2
-        bottom = r + tl.sqrt(tl.maximum(below * rr, 0.0))
+        bottom = tl.abs(r) + tl.sqrt(tl.maximum(below * rr, 0.0))
         if FANNED:
             side = tl.abs(t) + tl.sqrt(tl.maximum(below * tt, 0.0))
-            bottom = tl.where(bottom > 0.0, tl.sqrt(bottom * bottom + side * side), side)
+            bottom = tl.sqrt(bottom * bottom + side * side)
         bottom = tl.where(opaque, tl.maximum(bottom, 3.0 * spread), bottom)  # where depth 0 clips the window
         top_row = tl.where(early, 0.0, (top - near) / row_cm - 0.5)
         end_row = (bottom - near) / row_cm - 0.5
@@ -297,6 +297,8 @@ def slice_gaussians(
         first_row = tl.minimum(tl.maximum(tl.floor(top_row), 0.0), height + 0.0).to(tl.int32)
         first_row = tl.where(opaque, tl.minimum(first_row, last_row), first_row)
         clipped = early | (top < 6.4 * spread)
+        if WRAP:
+            clipped = clipped | every
         kept = kept & (first_column <= last_column) & (first_row <= last_row)
         row = tl.minimum(tl.maximum((r - near) / row_cm, 0.0), height - 1.0).to(tl.int32)
 
