@@ -4,7 +4,7 @@
  * the same to the bit. Each worker finds anew which Gaussians the plane cuts; the first one turns the planes into the frame.
  */
 
-import type { Library, Rendered } from "./library.js";
+import { wantedPlanes, type Library, type Rendered } from "./library.js";
 import { Thread } from "./thread.js";
 import type { LoadRequest } from "./worker.js";
 
@@ -45,12 +45,13 @@ export class Crew {
   }
 
   async #render(view: number, at: number, pose: readonly number[]): Promise<(Rendered & { workers: number }) | undefined> {
-    const { height, width, planes } = this.library.plan(at, pose);
+    const plan = this.library.plan(at, pose);
+    const { height, width } = plan;
     const strips = Math.ceil(width / STRIP);
     if (strips > 1) this.#start();
     const helpers = this.#ready.slice(0, strips - 1);
     if (helpers.length === 0) return undefined;
-    const rows = height * planes.filter(Boolean).length;
+    const rows = height * wantedPlanes(plan).filter(Boolean).length;
     const end = (share: number): number => Math.min(width, STRIP * Math.round((share * strips) / (helpers.length + 1)));
     const lines = [0, ...helpers].map((_, share) => ({ first: end(share), end: end(share + 1), floats: rows * (end(share + 1) - end(share)) }));
     const asked = helpers.map((thread, number) => thread.ask<Float32Array>({ act: "draw", view, pose, ...lines[number + 1]! }).catch(() => undefined));

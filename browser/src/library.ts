@@ -1,25 +1,12 @@
 /** libultragray (model/library/ultragray.h), compiled to WebAssembly: what goes into its memory, and out of it, is copied. */
 
-interface Exports {
+import { EXTRAPOLATION, PLAN, type Functions } from "./generated/interface.js";
+
+interface Exports extends Functions {
   memory: WebAssembly.Memory;
   _initialize(): void;
   malloc(bytes: number): number;
   free(at: number): void;
-  ultragray_load(bytes: number, size: number): number;
-  ultragray_load_part(bytes: number, size: number): number;
-  ultragray_scene_info(scene: number): number;
-  ultragray_free_scene(scene: number): void;
-  ultragray_prepare(scene: number, settings: number): number;
-  ultragray_view_info(view: number): number;
-  ultragray_frame_bytes(view: number): number;
-  ultragray_free_view(view: number): void;
-  ultragray_render(view: number, poses: number, count: number, threads: number, pixels: number, extrapolations: number): number;
-  ultragray_gaussians(scene: number, count: number): number;
-  ultragray_harmonics(scene: number): number;
-  ultragray_plan_of(view: number, pose: number, plan: number): number;
-  ultragray_draw(view: number, pose: number, first: number, end: number, planes: number): number;
-  ultragray_finish(view: number, pose: number, planes: number, threads: number, pixels: number, extrapolation: number): number;
-  ultragray_problem(): number;
 }
 
 /** How much of a file is at hand. */
@@ -40,23 +27,11 @@ export interface Gaussians {
   harmonics: Float32Array<ArrayBuffer>; // [count, (degree + 1)^2]
 }
 
-/** ultragray_plan: what the planes of a pose are drawn by; `planes`: whether B-mode, echo, transmittance, coverage are wanted. */
-export interface Plan {
-  axes: number[];
-  origin: number[];
-  near: number;
-  row: number;
-  most: number;
-  start: number;
-  pitch: number; // from line to line
-  beam: number[];
-  fanned: boolean;
-  wrap: boolean;
-  height: number;
-  width: number;
-  planes: boolean[];
-  displaced: boolean; // tissue, which the library alone draws
-}
+/** ultragray_plan: what the planes of a pose are drawn by. */
+export type Plan = { [Field in keyof typeof PLAN]: (typeof PLAN)[Field] extends 1 ? number : number[] };
+
+/** Whether B-mode, echo, transmittance and coverage are wanted. */
+export const wantedPlanes = ({ bmode, echo, transmittance, coverage }: Plan): boolean[] => [bmode, echo, transmittance, coverage].map(Boolean);
 
 /** Some scan lines of the planes of a pose, from `first` to before `end`, and how many numbers that are. */
 export interface Lines {
@@ -67,8 +42,8 @@ export interface Lines {
 
 const NO_FILE = 8; // WASI's "bad file descriptor": there are no files
 const POSE_BYTES = 128;
-const FIGURES = 7; // of ultragray_extrapolation, a double each
-const PLAN_NUMBERS = 30;
+const FIGURES = Object.keys(EXTRAPOLATION).length; // a double each
+const PLAN_NUMBERS = Object.values(PLAN).reduce<number>((sum, count) => sum + count, 0);
 
 /** One instance of the module, with a memory of its own. Whatever is wrong with an input is an Error, in a sentence. */
 export class Library {
@@ -134,27 +109,19 @@ export class Library {
   }
 
   plan(view: number, pose: readonly number[]): Plan {
-    return this.#room(POSE_BYTES + 8 * PLAN_NUMBERS, (at) => {
-      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
-      if (this.exports.ultragray_plan_of(view, at, at + POSE_BYTES) !== 0) this.#fail();
-      const numbers = [...new Float64Array(this.exports.memory.buffer, at + POSE_BYTES, PLAN_NUMBERS)];
-      const next = (count: number): number[] => numbers.splice(0, count);
-      const [axes, origin] = [next(9), next(3)];
-      const [near, row, most, start, span] = next(5) as [number, number, number, number, number];
-      const beam = next(4);
-      const [fanned, wrap] = next(2).map(Boolean) as [boolean, boolean];
-      const [height, width] = next(2) as [number, number];
-      const planes = next(4).map(Boolean);
-      return { axes, origin, near, row, most, start, pitch: span / width, beam, fanned, wrap, height, width, planes, displaced: numbers[0] !== 0 };
+    return this.#posed(pose, 8 * PLAN_NUMBERS, (at, plan) => {
+      if (this.exports.ultragray_plan_of(view, at, plan) !== 0) this.#fail();
+      const numbers = [...new Float64Array(this.exports.memory.buffer, plan, PLAN_NUMBERS)];
+      const fields = Object.entries(PLAN).map(([field, count]) => [field, count === 1 ? numbers.shift() : numbers.splice(0, count)]);
+      return Object.fromEntries(fields) as Plan;
     });
   }
 
   /** [H, end - first] of each plane that the plan wants, one after another. */
   draw(view: number, pose: readonly number[], { first, end, floats }: Lines): Float32Array<ArrayBuffer> {
-    return this.#room(POSE_BYTES + 4 * floats, (at) => {
-      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
-      if (this.exports.ultragray_draw(view, at, first, end, at + POSE_BYTES) !== 0) this.#fail();
-      return new Float32Array(this.exports.memory.buffer as ArrayBuffer, at + POSE_BYTES, floats).slice();
+    return this.#posed(pose, 4 * floats, (at, planes) => {
+      if (this.exports.ultragray_draw(view, at, first, end, planes) !== 0) this.#fail();
+      return new Float32Array(this.exports.memory.buffer as ArrayBuffer, planes, floats).slice();
     });
   }
 
@@ -170,10 +137,8 @@ export class Library {
   /** A frame that `draw` writes into the memory; the pose, figures, room for so many bytes and pixels follow each other. */
   #frame(view: number, pose: readonly number[], bytes: number, draw: (pose: number, figures: number, pixels: number) => number): Rendered {
     const size = this.exports.ultragray_frame_bytes(view);
-    return this.#room(POSE_BYTES + 8 * FIGURES + bytes + size, (at) => {
-      const figures = at + POSE_BYTES;
+    return this.#posed(pose, 8 * FIGURES + bytes + size, (at, figures) => {
       const pixels = figures + 8 * FIGURES + bytes;
-      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
       if (draw(at, figures, pixels) !== 0) this.#fail();
       const { buffer } = this.exports.memory;
       return { pixels: new Uint8Array(buffer).slice(pixels, pixels + size), figures: new Float64Array(buffer, figures, FIGURES).slice() };
@@ -185,6 +150,14 @@ export class Library {
     return this.#room(bytes.length, (at) => {
       new Uint8Array(this.exports.memory.buffer).set(bytes, at);
       return act(at);
+    });
+  }
+
+  /** What `act` makes of a pose that is in the memory, and of room for so many bytes, while it runs. */
+  #posed<Result>(pose: readonly number[], bytes: number, act: (pose: number, room: number) => Result): Result {
+    return this.#room(POSE_BYTES + bytes, (at) => {
+      new Float64Array(this.exports.memory.buffer, at, 16).set(pose);
+      return act(at, at + POSE_BYTES);
     });
   }
 

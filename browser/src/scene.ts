@@ -3,6 +3,7 @@
 import type { components } from "./generated/openapi.js";
 import type { Pose } from "./pose.js";
 import { Arrival } from "./arrival.js";
+import { EXTRAPOLATION } from "./generated/interface.js";
 import type { Extent } from "./library.js";
 import { compiled, Thread } from "./thread.js";
 import type { Drawn, Loaded, RendererChoice, RendererName } from "./worker.js";
@@ -16,7 +17,6 @@ export type Output = string;
 
 /** How far a frame extrapolates from what its scene was trained on, and how much to trust it; null: not known. */
 export type Extrapolation = Schemas["Extrapolation"];
-const FIGURES = ["distance_mm", "angle_deg", "confidence", "supported_share", "contact_share", "indentation_mm", "force_n"] as const; // as the library has them
 
 /** Where the pixels of a picture lie in the image plane; see Picture of the HTTP reference. */
 export type Picture = Schemas["Picture"];
@@ -121,7 +121,7 @@ class LocalScene implements Scene {
     const { view, info } = await this.#view(JSON.stringify(settings));
     const frame = await this.thread.ask<Drawn>({ act: "render", view, pose: checked(pose) });
     [this.renderer, this.workers] = [frame.renderer, frame.workers];
-    const figures = FIGURES.map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
+    const figures = Object.keys(EXTRAPOLATION).map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
     return new Frame(info, frame.pixels, Object.fromEntries(figures) as Extrapolation);
   }
 

@@ -8,7 +8,7 @@
 namespace ultragray::library {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846, kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 constexpr int kPointsPerSide = 6;
 constexpr float kMmByDegree = 0.02f;
 constexpr double kFarMm = 20.0, kSmallestMm = 1e-6, kNeighbourhoodMm = 3.0, kReach = 1.3, kLeastSum = 1e-9;
@@ -48,9 +48,8 @@ ViewMeasures TrainingViews::measure(const Pose& pose, const Probing& probe, int 
     std::vector<float> points, angles, facing, distances(3 * count), around(views);
     for (int row = 0; row < points_per_side; ++row)
         for (int column = 0; column < points_per_side; ++column) {
-            Vector origin, direction;
-            probe.ray(probe.across(column, points_per_side), origin, direction);
-            const Vector point = pose.at(plus(origin, times(direction, probe.depth_mm(row, points_per_side))));
+            const Ray ray = probe.ray(probe.across(column, points_per_side));
+            const Vector point = pose.at(ray.at(probe.depth_mm(row, points_per_side)));
             for (const double one : point) points.push_back(float(one));
         }
     for (const Pose& view : filled_) {
@@ -105,24 +104,21 @@ ConfidenceModel ConfidenceModel::read(const Value& value) {
     fields.require("error", [&](const Value& it) { it.number(share); });
     fields.require("support", unless_null([&](const Value& it) {
                        Fields support(it, "support");
-                       model.support.emplace();
-                       support.require("gain", [&](const Value& one) { model.support->gain = one.number(positive); });
-                       support.require("share", [&](const Value& one) { model.support->share = one.number(positive); });
-                       support.require("reach_mm",
-                                       [&](const Value& one) { model.support->reach_mm = one.number(positive); });
+                       auto& [gain, share, reach_mm] = model.support.emplace();
+                       for (auto [name, into] : {std::pair("gain", &gain), {"share", &share}, {"reach_mm", &reach_mm}})
+                           support.require(name, [&, into = into](const Value& one) { *into = one.number(positive); });
                        support.end();
                    }));
     fields.require("fitted_to_mm", unless_null([&](const Value& it) { model.fitted_to_mm = it.number(at_least_0); }));
-    fields.require(
-        "uncertainty", unless_null([&](const Value& it) {
-            Fields uncertainty(it, "uncertainty");
-            model.uncertainty.emplace();
-            uncertainty.require("variances",
-                                [&](const Value& one) { model.uncertainty->variances = one.vector<10>(at_least_0); });
-            uncertainty.require("level", [&](const Value& one) { model.uncertainty->level = one.vector<8>(at_least_0); });
-            uncertainty.require("spread", [&](const Value& one) { model.uncertainty->spread = one.vector<8>(at_least_0); });
-            uncertainty.end();
-        }));
+    fields.require("uncertainty", unless_null([&](const Value& it) {
+                       Fields uncertainty(it, "uncertainty");
+                       Uncertainty& of = model.uncertainty.emplace();
+                       uncertainty.require("variances",
+                                           [&](const Value& one) { of.variances = one.vector<10>(at_least_0); });
+                       uncertainty.require("level", [&](const Value& one) { of.level = one.vector<8>(at_least_0); });
+                       uncertainty.require("spread", [&](const Value& one) { of.spread = one.vector<8>(at_least_0); });
+                       uncertainty.end();
+                   }));
     fields.end();
     return model;
 }

@@ -78,23 +78,15 @@ Skin::Skin(const std::vector<Pose>& poses, const std::optional<Probe>& given) {
             "around");
     const Vector out = times(down, -1.0 / length(down)), lateral = views[views.size() / 2].axis(0);
     Vector along = minus(lateral, times(out, dot(lateral, out)));
-    if (length(along) < kAlongTheSkin) {  // a view that looks along it
-        int flattest = 0;
-        for (int d = 1; d < 3; ++d)
-            if (std::fabs(out[d]) < std::fabs(out[flattest])) flattest = d;
-        Vector unit{};
-        unit[flattest] = 1.0;
-        along = cross(out, unit);
-    }
+    if (length(along) < kAlongTheSkin) along = perpendicular(out);  // a view that looks along it
     axes_[0] = times(along, 1.0 / length(along)), axes_[1] = cross(out, axes_[0]), axes_[2] = out;
 
     const int count = 2 + int(std::ceil(probe.breadth_mm(probe.face_mm) / kLeastCellMm));
     std::vector<Vector> points;
     for (const Pose& view : views)
         for (int k = 0; k < count; ++k) {
-            Vector origin, direction;
-            probe.ray(probe.start() + probe.span * (double(k) / (count - 1)), origin, direction);
-            points.push_back(along_axes(view.at(plus(origin, times(direction, probe.face_mm)))));
+            const Ray ray = probe.ray(probe.start() + probe.span * (double(k) / (count - 1)));
+            points.push_back(times(axes_, view.at(ray.at(probe.face_mm))));
         }
     settle(points);
 }
@@ -139,11 +131,12 @@ void Skin::settle(const std::vector<Vector>& points) {
 
 // By Newton's method, of all points together: until none of them moves any farther.
 std::vector<double> Skin::distances_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions,
-                                       const std::vector<float>& heights) const {
+                                       Side side) const {
+    const std::vector<float>& heights = side == Side::Outermost ? outermost_ : innermost_;
     std::vector<Vector> places, ways;
     for (size_t k = 0; k < points.size(); ++k) {
-        places.push_back(along_axes(minus(points[k], origin_)));
-        ways.push_back(along_axes(directions[k]));
+        places.push_back(times(axes_, minus(points[k], origin_)));
+        ways.push_back(times(axes_, directions[k]));
     }
     std::vector<double> along(points.size());
     double most = kInfinity;
@@ -172,28 +165,18 @@ std::vector<double> Skin::distances_mm(const std::vector<Vector>& points, const 
     return along;
 }
 
-std::vector<double> Skin::gaps_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const {
-    return distances_mm(points, directions, outermost_);
-}
-
-std::vector<double> Skin::pressed_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const {
-    std::vector<double> pressed = distances_mm(points, directions, innermost_);
-    for (double& one : pressed) one = std::isfinite(one) ? std::max(-one, 0.0) : 0.0;
-    return pressed;
-}
-
 Touch::Touch(const Skin& skin, const Probing& probe, const Pose& pose, int width) : lines(width), depths_mm(width) {
     std::vector<Vector> faces, directions;
     for (int j = 0; j < width; ++j) {
-        Vector origin, direction;
-        probe.ray(probe.across(j, width), origin, direction);
-        faces.push_back(pose.at(plus(origin, times(direction, probe.face_mm))));
-        directions.push_back(pose.turned(direction));
+        const Ray ray = probe.ray(probe.across(j, width));
+        faces.push_back(pose.at(ray.at(probe.face_mm)));
+        directions.push_back(pose.turned(ray.direction));
     }
-    const std::vector<double> gaps = skin.gaps_mm(faces, directions), pressed = skin.pressed_mm(faces, directions);
+    const std::vector<double> gaps = skin.distances_mm(faces, directions, Skin::Side::Outermost);
+    const std::vector<double> ways = skin.distances_mm(faces, directions, Skin::Side::Innermost);
     for (int j = 0; j < width; ++j) {
         lines[j] = gaps[j] <= kCouplingMm;
-        depths_mm[j] = lines[j] ? pressed[j] : 0.0;
+        depths_mm[j] = lines[j] && std::isfinite(ways[j]) ? std::max(-ways[j], 0.0) : 0.0;
     }
     count = int(std::count(lines.begin(), lines.end(), true));
 }

@@ -12,19 +12,17 @@ class Skin {
     // all around.
     Skin(const std::vector<Pose>& poses, const std::optional<Probe>& probe);
 
-    // The way from points to the skin at rest along unit directions, mm, less than 0 where it lies behind; infinite where no
-    // skin is known, and along a direction that does not run into the body.
-    std::vector<double> gaps_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const;
-    // How far points lie beyond the innermost training face, mm, at least 0.
-    std::vector<double> pressed_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions) const;
+    enum class Side { Outermost, Innermost };  // the skin at rest, and as far as a face has pressed it
+    // The way from points to a side along unit directions, mm, less than 0 where it lies behind; infinite where no skin is
+    // known, and along a direction that does not run into the body.
+    std::vector<double> distances_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions,
+                                     Side side) const;
 
  private:
     void settle(const std::vector<Vector>& points);
-    std::vector<double> distances_mm(const std::vector<Vector>& points, const std::vector<Vector>& directions,
-                                     const std::vector<float>& heights) const;
-    Vector along_axes(const Vector& v) const { return {dot(axes_[0], v), dot(axes_[1], v), dot(axes_[2], v)}; }
 
-    Vector origin_, axes_[3];  // the centre of the first cell, at height 0; along rows, along columns, out of the body
+    Vector origin_;  // the centre of the first cell, at height 0
+    Matrix axes_;    // along rows, along columns, out of the body
     double cell_mm_;
     int rows_, columns_;
     std::vector<float> outermost_, innermost_;  // [rows, columns] mm

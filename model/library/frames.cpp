@@ -19,32 +19,28 @@ const std::vector<std::string> kOutputs = {"bmode",       "echo",   "transmittan
 bool is_numbers(const std::string& output) { return output == "labels"; }
 bool tells_support(const std::string& output) { return output == "coverage" || output == "uncertainty"; }
 
-// Of a pixel; 0 for an encoding that is left to a service.
-size_t bytes_of(Encoding encoding) {
+// The name of an encoding, and the bytes of a pixel; 0 for one that is left to a service.
+std::pair<const char*, size_t> stored_as(Encoding encoding) {
     switch (encoding) {
         case Encoding::Uint8:
-            return 1;
+            return {"uint8", 1};
         case Encoding::Float16:
-            return 2;
+            return {"float16", 2};
         case Encoding::Float32:
-            return 4;
+            return {"float32", 4};
         case Encoding::Png:
         case Encoding::Jpeg:
         case Encoding::Npz:
-            return 0;
+            return {"", 0};
     }
     throw Fault("there is no such encoding");
-}
-
-const char* word_of(Encoding encoding) {
-    return encoding == Encoding::Uint8 ? "uint8" : encoding == Encoding::Float16 ? "float16" : "float32";
 }
 
 // What this library leaves to a service.
 void check_local(const RenderSettings& settings, const SceneInfo& info) {
     const auto refuse = [](const std::string& field, const std::string& reason) { throw Fault(field + " " + reason); };
     if (settings.registration) refuse("registration", "is kept by a service: local poses are probe to scene");
-    if (bytes_of(settings.encoding) == 0) refuse("encoding", "must be uint8, float32 or float16 for local frames");
+    if (stored_as(settings.encoding).second == 0) refuse("encoding", "must be uint8, float32 or float16 for local frames");
     if (settings.min_confidence && !info.confidence)
         refuse("min_confidence", "needs a scene that knows the confidence of its frames; this one was trained without");
     if (settings.speckle == Speckle::Natural && !info.speckle)
@@ -204,7 +200,7 @@ View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings
         picture_.step[0] = -picture_.step[0];
     }
     json_ = Json{{"outputs", settings_.outputs},
-                 {"encoding", word_of(settings_.encoding)},
+                 {"encoding", stored_as(settings_.encoding).first},
                  {"rendered_height", height_},
                  {"rendered_width", width_},
                  {"height", picture_.height},
@@ -219,7 +215,7 @@ View::View(std::shared_ptr<const LoadedScene> scene, const std::string& settings
 }
 
 size_t View::bytes_per_pixel(const std::string& output) const {
-    return is_numbers(output) ? 1 : bytes_of(settings_.encoding);
+    return is_numbers(output) ? 1 : stored_as(settings_.encoding).second;
 }
 
 size_t View::frame_bytes() const {
@@ -232,8 +228,7 @@ void View::render(const double* poses, size_t count, int threads, void* pixels, 
     auto* out = static_cast<unsigned char*>(pixels);
     const bool judged = extrapolations != nullptr || settings_.min_confidence;
     for (size_t c = 0; c < count; ++c) {
-        const std::string name = "poses[" + std::to_string(c) + "]";
-        const Sight sight = sight_of(Pose::read(poses + 16 * c, name), name);
+        const Sight sight = sight_of(poses + 16 * c, "poses[" + std::to_string(c) + "]");
         Extrapolation found{};
         if (judged) found = judged_by_pose(sight);
         Planes planes = wanted_planes(judged);
@@ -259,14 +254,14 @@ void View::draw(const double* pose, int first_line, int end_line, float* drawn) 
                     std::to_string(kStripLines) + " to another or to the last, got " + std::to_string(first_line) + " to " +
                     std::to_string(end_line));
     Planes planes = wanted_planes(true);
-    draw(sight_of(Pose::read(pose, "pose"), "pose"), {first_line, end_line}, 1, planes);
-    for (const std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage})
+    draw(sight_of(pose, "pose"), {first_line, end_line}, 1, planes);
+    for (const std::vector<float>* plane : planes.all())
         for (size_t at = first_line; at < plane->size(); at += width_)
             drawn = std::copy_n(&(*plane)[at], end_line - first_line, drawn);
 }
 
 ultragray_plan View::plan(const double* pose) const {
-    const Sight sight = sight_of(Pose::read(pose, "pose"), "pose");
+    const Sight sight = sight_of(pose, "pose");
     const ProbeGeometry& probe = sight.geometry;
     const Planes planes = wanted_planes(true);
     ultragray_plan plan{};
@@ -287,10 +282,10 @@ ultragray_plan View::plan(const double* pose) const {
 }
 
 Extrapolation View::finish(const double* pose, const float* drawn, int threads, void* pixels) const {
-    const Sight sight = sight_of(Pose::read(pose, "pose"), "pose");
+    const Sight sight = sight_of(pose, "pose");
     Extrapolation found = judged_by_pose(sight);
     Planes planes = wanted_planes(true);
-    for (std::vector<float>* plane : {&planes.bmode, &planes.echo, &planes.transmittance, &planes.coverage}) {
+    for (std::vector<float>* plane : planes.all()) {
         std::copy_n(drawn, plane->size(), plane->data());
         drawn += plane->size();
     }
@@ -302,7 +297,8 @@ bool View::asks_for(const char* output) const {
     return std::find(settings_.outputs.begin(), settings_.outputs.end(), output) != settings_.outputs.end();
 }
 
-Sight View::sight_of(const Pose& pose, const std::string& name) const {
+Sight View::sight_of(const double* matrix, const std::string& name) const {
+    const Pose pose = Pose::read(matrix, name);
     Sight sight{name, pose, scene_->at_rest(pose), probe_.kernel(height_, beam_), {}, {}, {}};
     if (settings_.contact) sight.touch.emplace(scene_->skin(), probe_, pose, width_);
     if (press_) press(sight);

@@ -76,7 +76,7 @@ class View {
         float down, right;
         bool inside;
     };
-    Sight sight_of(const Pose& pose, const std::string& name) const;
+    Sight sight_of(const double* matrix, const std::string& name) const;
     void press(Sight& sight) const;
     Planes wanted_planes(bool judged) const;
     void draw(const Sight& sight, const Lines& lines, int threads, Planes& planes) const;

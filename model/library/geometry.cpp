@@ -7,7 +7,6 @@
 namespace ultragray::library {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kRotationTolerance = 1e-3, kExact = 1e-14, kMostPosition = 1e6;
 constexpr int kPolarSteps = 8;  // of Newton's iteration from within the tolerance: three would do
 constexpr int kSquarings = 60;
@@ -15,43 +14,39 @@ constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 double radians(double degrees) { return degrees * (kPi / 180.0); }
 
-double determinant(const double r[3][3]) {
-    return r[0][0] * (r[1][1] * r[2][2] - r[1][2] * r[2][1]) - r[0][1] * (r[1][0] * r[2][2] - r[1][2] * r[2][0]) +
-           r[0][2] * (r[1][0] * r[2][1] - r[1][1] * r[2][0]);
-}
-
 // The largest entry of RᵀR − 1.
-double deviation_of(const double r[3][3]) {
+double deviation_of(const Matrix& r) {
+    const Matrix square = times(transposed(r), r);
     double most = 0;
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) {
-            double product = 0;
-            for (int k = 0; k < 3; ++k) product += r[k][i] * r[k][j];
-            const double off = std::fabs(product - (i == j));
+            const double off = std::fabs(square[i][j] - (i == j));
             if (!(off <= most)) most = off;  // NaN is kept
         }
     return most;
 }
 
 // The nearest rotation, R ← R (3 − RᵀR) / 2.
-void make_exact(double r[3][3]) {
+void make_exact(Matrix& r) {
     for (int step = 0; step < kPolarSteps && deviation_of(r) > kExact; ++step) {
-        double square[3][3], next[3][3];
+        Matrix half = times(transposed(r), r);
         for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) {
-                square[i][j] = (i == j) * 3.0;
-                for (int k = 0; k < 3; ++k) square[i][j] -= r[k][i] * r[k][j];
-            }
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) {
-                next[i][j] = 0;
-                for (int k = 0; k < 3; ++k) next[i][j] += 0.5 * r[i][k] * square[k][j];
-            }
-        std::copy(&next[0][0], &next[0][0] + 9, &r[0][0]);
+            for (int j = 0; j < 3; ++j) half[i][j] = 0.5 * ((i == j) * 3.0 - half[i][j]);
+        r = times(r, half);
     }
 }
 
 }  // namespace
+
+Vector perpendicular(const Vector& v) {
+    int flattest = 0;
+    for (int d = 1; d < 3; ++d)
+        if (std::fabs(v[d]) < std::fabs(v[flattest])) flattest = d;
+    Vector unit{};
+    unit[flattest] = 1.0;
+    const Vector found = cross(v, unit);
+    return times(found, 1.0 / length(found));
+}
 
 Pose Pose::read(const double* matrix, const std::string& name) {
     Pose pose;
@@ -68,7 +63,7 @@ Pose Pose::read(const double* matrix, const std::string& name) {
     if (!(deviation <= kRotationTolerance))
         throw Fault(name + " must hold a rotation: the largest entry of RᵀR − 1 must be at most 0.001, got " +
                     in_words(deviation));
-    if (determinant(pose.turn) <= 0)
+    if (dot(cross(pose.axis(0), pose.axis(1)), pose.axis(2)) <= 0)
         throw Fault(name + " must hold a rotation with determinant +1, got a mirrored one (−1)");
     if (deviation > kExact) make_exact(pose.turn);
     return pose;
@@ -84,25 +79,7 @@ std::array<double, 16> Pose::matrix() const {
     return rows;
 }
 
-Vector Pose::turned(const Vector& v) const {
-    Vector out;
-    for (int i = 0; i < 3; ++i) out[i] = turn[i][0] * v[0] + turn[i][1] * v[1] + turn[i][2] * v[2];
-    return out;
-}
-
-Vector Pose::turned_back(const Vector& v) const {
-    Vector out;
-    for (int i = 0; i < 3; ++i) out[i] = turn[0][i] * v[0] + turn[1][i] * v[1] + turn[2][i] * v[2];
-    return out;
-}
-
-Vector Pose::at(const Vector& point) const {
-    Vector out = turned(point);
-    for (int i = 0; i < 3; ++i) out[i] += origin[i];
-    return out;
-}
-
-void quaternion_products(const double r[3][3], double products[4][4]) {
+void quaternion_products(const Matrix& r, double products[4][4]) {
     const double trace = r[0][0] + r[1][1] + r[2][2];
     const double odd[3] = {r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]};
     products[0][0] = 1.0 + trace;
@@ -114,14 +91,14 @@ void quaternion_products(const double r[3][3], double products[4][4]) {
 
 // Of all rotations, the nearest to a mean of some is that of the quaternion q which has the largest qᵀ K q, K being the
 // mean of their products: by squaring K until nothing but that eigenvector's product is left.
-void mean_axes(const std::vector<Pose>& poses, double axes[3][3]) {
-    double mean[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, k[4][4], square[4][4];
-    for (int i = 0; i < 3 && !poses.empty(); ++i)
-        for (int j = 0; j < 3; ++j) {
-            mean[i][j] = 0;
-            for (const Pose& pose : poses) mean[i][j] += pose.turn[i][j];
-            mean[i][j] /= double(poses.size());
-        }
+Matrix mean_axes(const std::vector<Pose>& poses) {
+    Matrix mean{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+    double k[4][4], square[4][4];
+    for (int i = 0; i < 3 && !poses.empty(); ++i) {
+        mean[i] = {};
+        for (const Pose& pose : poses) mean[i] = plus(mean[i], pose.turn[i]);
+        for (double& one : mean[i]) one /= double(poses.size());
+    }
     quaternion_products(mean, k);
     for (int step = 0; step < kSquarings; ++step) {
         const double trace = k[0][0] + k[1][1] + k[2][2] + k[3][3];
@@ -137,11 +114,12 @@ void mean_axes(const std::vector<Pose>& poses, double axes[3][3]) {
         if (k[i][i] > k[largest][largest]) largest = i;
     const double* q = k[largest];
     const double norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], w = q[0], x = q[1], y = q[2], z = q[3];
-    const double rotation[3][3] = {{w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)},
-                                   {2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)},
-                                   {2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z}};
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) axes[i][j] = rotation[i][j] / norm2;
+    Matrix axes{{{w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)},
+                 {2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)},
+                 {2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z}}};
+    for (Vector& row : axes)
+        for (double& one : row) one /= norm2;
+    return axes;
 }
 
 namespace {
@@ -182,16 +160,13 @@ double Probing::half_width_mm() const {
     return half;
 }
 
-void Probing::ray(double across, Vector& origin, Vector& direction) const {
+Ray Probing::ray(double across) const {
     const double angle = radians(is_angular() ? across : steering_deg);
-    origin = {is_angular() ? 0.0 : across, 0.0, 0.0};
-    direction = {std::sin(angle), 0.0, std::cos(angle)};
+    return {{is_angular() ? 0.0 : across, 0.0, 0.0}, {std::sin(angle), 0.0, std::cos(angle)}};
 }
 
 Vector Probing::point(double row, double column) const {
-    Vector origin, direction;
-    ray(start() + span * column, origin, direction);
-    return plus(origin, times(direction, near_mm + length_mm() * row));
+    return ray(start() + span * column).at(near_mm + length_mm() * row);
 }
 
 std::vector<Vector> Probing::corners() const {
@@ -222,7 +197,7 @@ void Probing::kernel_pose(const Pose& pose_cm, double matrix[16]) const {
     }
     std::fill(matrix, matrix + 16, 0.0);
     for (int i = 0; i < 3; ++i) {
-        const double* row = pose_cm.turn[i];
+        const Vector& row = pose_cm.turn[i];
         matrix[4 * i] = row[0] + row[2] * axis[0];
         matrix[4 * i + 1] = row[1];
         matrix[4 * i + 2] = row[2] * axis[2];
@@ -234,7 +209,6 @@ void Probing::kernel_pose(const Pose& pose_cm, double matrix[16]) const {
 namespace {
 
 Beam kernel_beam(const std::optional<ElevationBeam>& beam, double near_cm, double far_cm, double face_mm) {
-    static const double kFwhmPerSigma = 2.0 * std::sqrt(2.0 * std::log(2.0));
     if (!beam || beam->thickness_mm == 0.0) return {0.0, 0.0, 0.0, 0.0};
     const double sigma = beam->thickness_mm / (10.0 * kFwhmPerSigma);
     const double focus = (beam->focus_mm.value_or(0.0) + face_mm) / 10.0;

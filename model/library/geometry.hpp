@@ -10,7 +10,10 @@
 
 namespace ultragray::library {
 
+constexpr double kPi = 3.14159265358979323846, kFwhmPerSigma = 2.3548200450309493;  // 2 sqrt(2 log 2)
+
 using Vector = std::array<double, 3>;
+using Matrix = std::array<Vector, 3>;  // rows
 
 inline double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 inline Vector minus(const Vector& a, const Vector& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
@@ -20,30 +23,45 @@ inline Vector cross(const Vector& a, const Vector& b) {
     return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
 }
 inline double length(const Vector& a) { return std::sqrt(dot(a, a)); }
+inline Vector times(const Matrix& m, const Vector& v) { return {dot(m[0], v), dot(m[1], v), dot(m[2], v)}; }
+inline Matrix transposed(const Matrix& m) {
+    return {{{m[0][0], m[1][0], m[2][0]}, {m[0][1], m[1][1], m[2][1]}, {m[0][2], m[1][2], m[2][2]}}};
+}
+inline Matrix times(const Matrix& a, const Matrix& b) {
+    const Matrix columns = transposed(b);
+    return {times(columns, a[0]), times(columns, a[1]), times(columns, a[2])};
+}
+Vector perpendicular(const Vector& v);  // some unit vector at right angles to another
 
 // A rigid transform from the probe to the scene, and the point that a point goes to.
 struct Pose {
-    double turn[3][3];
+    Matrix turn;
     Vector origin;
 
     // Of a matrix [4, 4], row by row; a rotation within 1e-3 of a proper one becomes it. `name` is the caller's. Throws
     // Fault.
     static Pose read(const double* matrix, const std::string& name);
     std::array<double, 16> matrix() const;
-    Vector turned(const Vector& v) const;
-    Vector turned_back(const Vector& v) const;
-    Vector at(const Vector& point) const;
+    Vector turned(const Vector& v) const { return times(turn, v); }
+    Vector turned_back(const Vector& v) const { return times(transposed(turn), v); }
+    Vector at(const Vector& point) const { return plus(turned(point), origin); }
     Vector axis(int which) const { return {turn[0][which], turn[1][which], turn[2][which]}; }  // lateral, elevation, axial
 };
 
 // 4 q qᵀ of the unit quaternion q of a rotation.
-void quaternion_products(const double rotation[3][3], double products[4][4]);
+void quaternion_products(const Matrix& rotation, double products[4][4]);
 // The lateral, elevation and axial directions (columns) of the rotation nearest to the mean of the poses' rotations.
-void mean_axes(const std::vector<Pose>& poses, double axes[3][3]);
+Matrix mean_axes(const std::vector<Pose>& poses);
 
 // A point of the image plane by its scan line: the depth along it, and its place `across`, mm or degrees.
 struct Place {
     double depth, across;  // a depth of NaN: no line comes by
+};
+
+// A scan line in the probe's frame: its point of depth 0, and its unit direction.
+struct Ray {
+    Vector origin, direction;
+    Vector at(double depth) const { return plus(origin, times(direction, depth)); }
 };
 
 // A probe, whatever its kind: its bundle of scan lines from `near_mm` to `far_mm`, and the depth of its face.
@@ -63,8 +81,7 @@ struct Probing {
     double breadth_mm(double depth) const;  // of a row of the image
     double half_width_mm() const;           // of the image, where it is widest
     double across(double column, int width) const { return start() + span * ((column + 0.5) / width); }
-    // The point of depth 0 of the line at a place, and its unit direction, in the probe's frame.
-    void ray(double across, Vector& origin, Vector& direction) const;
+    Ray ray(double across) const;
     Vector point(double row, double column) const;  // of image coordinates from 0 to 1, in the probe's frame
     std::vector<Vector> corners() const;
     Place place(double x, double z) const;

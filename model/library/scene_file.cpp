@@ -230,15 +230,14 @@ void check_values(const std::string& name, const std::vector<float>& values, int
 
 // The Gaussians of one label, of which only weights are drawn.
 std::unique_ptr<PreparedScene> part_of(const std::vector<uint8_t>& labels, int label, const RawSplats& raw) {
-    std::vector<float> means, scales, quats, transmittances, sh0;
-    for (int64_t i = 0; i < raw.count; ++i) {
-        if (labels[i] != label) continue;
-        means.insert(means.end(), raw.means + 3 * i, raw.means + 3 * i + 3);
-        scales.insert(scales.end(), raw.scales + 3 * i, raw.scales + 3 * i + 3);
-        quats.insert(quats.end(), raw.quats + 4 * i, raw.quats + 4 * i + 4);
-        transmittances.push_back(raw.transmittances[i]);
-        sh0.push_back(raw.sh0[i]);
-    }
+    const auto some_of = [&](const float* values, int width) {
+        std::vector<float> some;
+        for (int64_t i = 0; i < raw.count; ++i)
+            if (labels[i] == label) some.insert(some.end(), values + width * i, values + width * (i + 1));
+        return some;
+    };
+    const auto means = some_of(raw.means, 3), scales = some_of(raw.scales, 3), quats = some_of(raw.quats, 4);
+    const auto transmittances = some_of(raw.transmittances, 1), sh0 = some_of(raw.sh0, 1);
     if (sh0.empty()) return nullptr;
     const RawSplats some{means.data(),  scales.data(), quats.data(),        transmittances.data(),
                          sh0.data(),    nullptr,       int64_t(sh0.size()), 0,

@@ -7,7 +7,6 @@
 namespace ultragray::library {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kTurnRad = 0.47, kShear[2] = {0.618, 0.324}, kReach = 2.4, kLeastSigmaPixels = 0.3,
                  kMostSigmaSamples = 12.0;
 constexpr double kMostPlaneVariance = 0.6, kLeastColumnMm = 1e-6, kMostStep = 4096;
@@ -136,17 +135,13 @@ SpeckleSamples::SpeckleSamples(const SpeckleModel& model, const Probing& probe, 
 // The moments of the logarithm to base 2 of a power of mean 1: that of two exponential variables of means a and 1 - a, where
 // looks = 1 / (a² + (1 - a)²).
 SpeckleOfScene::SpeckleOfScene(const SpeckleModel& model, const std::vector<Pose>& poses) : model_(model) {
-    double axes[3][3];
-    mean_axes(poses, axes);
+    const Matrix axes = mean_axes(poses);
     const double cosine = std::cos(kTurnRad), sine = std::sin(kTurnRad);
-    const double turned[3][3] = {{cosine, 0.0, -sine}, {kShear[0], 1.0, kShear[1]}, {sine, 0.0, cosine}};
-    for (int i = 0; i < 3; ++i) {
-        axial_[i] = axes[i][2];
-        for (int j = 0; j < 3; ++j) {
-            to_cells_[i][j] = 0;
-            for (int k = 0; k < 3; ++k) to_cells_[i][j] += turned[i][k] / model.cell_mm[k] * axes[j][k];
-        }
-    }
+    Matrix turned{{{cosine, 0.0, -sine}, {kShear[0], 1.0, kShear[1]}, {sine, 0.0, cosine}}};
+    for (Vector& row : turned)
+        for (int k = 0; k < 3; ++k) row[k] /= model.cell_mm[k];
+    to_cells_ = times(turned, transposed(axes));
+    axial_ = transposed(axes)[2];
     constexpr int kPowers = 8001;
     first_look_ = 0.5 * (1.0 + std::sqrt(std::max(2.0 / model.looks - 1.0, 0.0)));
     const double second = 1.0 - first_look_;
@@ -173,16 +168,8 @@ std::vector<float> SpeckleOfScene::added(const std::vector<float>& bmode, const 
     const Probing& probe = samples.probe;
     const int columns = samples.columns;
     const double row_mm = probe.length_mm() / samples.height;
-    double to_cells[3][3];  // from mm in the probe's frame
-    Vector begin;
-    for (int i = 0; i < 3; ++i) {
-        const Vector row = {to_cells_[i][0], to_cells_[i][1], to_cells_[i][2]};
-        begin[i] = dot(row, pose.origin);
-        for (int j = 0; j < 3; ++j) to_cells[i][j] = dot(row, pose.axis(j));
-    }
-    const auto in_cells = [&](int axis, const Vector& v) {
-        return to_cells[axis][0] * v[0] + to_cells[axis][1] * v[1] + to_cells[axis][2] * v[2];
-    };
+    const Matrix to_cells = times(to_cells_, pose.turn);  // from mm in the probe's frame
+    const Vector begin = times(to_cells_, pose.origin);
     // A carrier gives echoes a phase where the probe is turned from the mean direction of the sweep.
     const Vector phase_by_mm = times(pose.turned_back(axial_), model_.wavenumber_per_mm);
     const double middle = 0.5 * (probe.near_mm + probe.far_mm), plane_phase = phase_by_mm[1] * model_.cell_mm[1];
@@ -191,13 +178,12 @@ std::vector<float> SpeckleOfScene::added(const std::vector<float>& bmode, const 
     for (int k = 0; k < columns; ++k) {
         const int column = samples.first_column + k * samples.column_step;
         const double across = probe.start() + probe.span * (column + 0.5) / samples.width;
-        Vector origin, direction;
-        probe.ray(across, origin, direction);
-        const Vector first = plus(origin, times(direction, probe.near_mm + row_mm * (samples.first_row + 0.5)));
-        const Vector step = times(direction, row_mm * samples.row_step);
+        const Ray ray = probe.ray(across);
+        const Vector first = times(to_cells, ray.at(probe.near_mm + row_mm * (samples.first_row + 0.5)));
+        const Vector step = times(to_cells, times(ray.direction, row_mm * samples.row_step));
         for (int axis = 0; axis < 3; ++axis) {
-            starts[axis * columns + k] = fixed(in_cells(axis, first) + begin[axis]);
-            steps[axis * columns + k] = fixed(in_cells(axis, step));
+            starts[axis * columns + k] = fixed(first[axis] + begin[axis]);
+            steps[axis * columns + k] = fixed(step[axis]);
         }
         const double phase = phase_by_mm[0] * (probe.is_angular() ? across * (kPi / 180.0) * middle : across);
         phases[k] = float(std::cos(phase)), phases[columns + k] = float(std::sin(phase));

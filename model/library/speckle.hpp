@@ -27,8 +27,8 @@ class SpeckleOfScene {
 
  private:
     SpeckleModel model_;
-    Vector axial_;           // of the sweep
-    double to_cells_[3][3];  // from mm
+    Vector axial_;     // of the sweep
+    Matrix to_cells_;  // from mm
     double first_look_, mean_, deviation_;
 };
 

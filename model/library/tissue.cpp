@@ -9,15 +9,9 @@ namespace {
 constexpr size_t kNeighbours = 8;
 constexpr double kSticking = 3.0, kLeastSpacing = 1e-3, kNoTurn = 1e-300;
 constexpr int kPolarSteps = 3, kWithinThePlane[3] = {0, 2, 4};
-using Rotation = double[3][3];
-
-void product(const Rotation a, const Rotation b, Rotation out) {
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) out[i][j] = a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j];
-}
 
 // Axis times angle, at most pi, of a rotation: by the largest component of its quaternion.
-Vector turn_of(const Rotation r) {
+Vector turn_of(const Matrix& r) {
     double products[4][4];
     quaternion_products(r, products);
     int largest = 0;
@@ -33,15 +27,15 @@ Vector turn_of(const Rotation r) {
 }
 
 // Rodrigues' formula.
-void rotation_of(const Vector& turn, Rotation out) {
-    const double angle = std::sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]);
-    const double scale = 1.0 / std::max(angle, kNoTurn), x = turn[0] * scale, y = turn[1] * scale, z = turn[2] * scale;
-    const Rotation cross = {{0, -z, y}, {z, 0, -x}, {-y, x, 0}};
-    Rotation square;
-    product(cross, cross, square);
+Matrix rotation_of(const Vector& turn) {
+    const double angle = length(turn);
+    const auto [x, y, z] = times(turn, 1.0 / std::max(angle, kNoTurn));
+    const Matrix cross{{{0, -z, y}, {z, 0, -x}, {-y, x, 0}}}, square = times(cross, cross);
     const double sine = std::sin(angle), versine = 1.0 - std::cos(angle);
+    Matrix rotation;
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) out[i][j] = (i == j) + sine * cross[i][j] + versine * square[i][j];
+        for (int j = 0; j < 3; ++j) rotation[i][j] = (i == j) + sine * cross[i][j] + versine * square[i][j];
+    return rotation;
 }
 
 Vector mean_corner(const Probing& probe) {
@@ -52,17 +46,15 @@ Vector mean_corner(const Probing& probe) {
     return mean;
 }
 
+double squares_between(const std::vector<double>& one, const std::vector<double>& other) {
+    double sum = 0;
+    for (size_t k = 0; k < one.size(); ++k) sum += (one[k] - other[k]) * (one[k] - other[k]);
+    return sum;
+}
+
 // errors⁻¹ · pose, of rigid motions.
 Pose undone(const Pose& error, const Pose& pose) {
-    Pose told;
-    const Vector off = {pose.origin[0] - error.origin[0], pose.origin[1] - error.origin[1],
-                        pose.origin[2] - error.origin[2]};
-    told.origin = error.turned_back(off);
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j)
-            told.turn[i][j] =
-                error.turn[0][i] * pose.turn[0][j] + error.turn[1][i] * pose.turn[1][j] + error.turn[2][i] * pose.turn[2][j];
-    return told;
+    return {times(transposed(error.turn), pose.turn), error.turned_back(minus(pose.origin, error.origin))};
 }
 
 }  // namespace
@@ -70,11 +62,8 @@ Pose undone(const Pose& error, const Pose& pose) {
 FollowingTissue::Path::Path(const std::vector<Pose>& poses, const Probing& probe) : poses_(poses), own_(probe.corners()) {
     for (const Pose& pose : poses) corners_.push_back(corners_from(pose));
     std::vector<double> steps;
-    for (size_t p = 1; p < corners_.size(); ++p) {
-        double squares = 0;
-        for (size_t k = 0; k < corners_[p].size(); ++k) squares += std::pow(corners_[p][k] - corners_[p - 1][k], 2);
-        steps.push_back(std::sqrt(squares / double(own_.size())));
-    }
+    for (size_t p = 1; p < corners_.size(); ++p)
+        steps.push_back(std::sqrt(squares_between(corners_[p], corners_[p - 1]) / double(own_.size())));
     double median = 0.0;
     if (!steps.empty()) {
         std::sort(steps.begin(), steps.end());
@@ -93,11 +82,8 @@ std::vector<double> FollowingTissue::Path::corners_from(const Pose& pose) const 
 std::vector<std::pair<size_t, double>> FollowingTissue::Path::nearest(const Pose& pose) const {
     const std::vector<double> asked = corners_from(pose);
     std::vector<std::pair<double, size_t>> squares;
-    for (size_t p = 0; p < corners_.size(); ++p) {
-        double sum = 0;
-        for (size_t k = 0; k < asked.size(); ++k) sum += (asked[k] - corners_[p][k]) * (asked[k] - corners_[p][k]);
-        squares.emplace_back(sum / double(own_.size()), p);
-    }
+    for (size_t p = 0; p < corners_.size(); ++p)
+        squares.emplace_back(squares_between(asked, corners_[p]) / double(own_.size()), p);
     const size_t count = std::min(kNeighbours, squares.size());
     std::partial_sort(squares.begin(), squares.begin() + count, squares.end());
     std::vector<std::pair<size_t, double>> found;
@@ -114,19 +100,12 @@ std::vector<std::pair<size_t, double>> FollowingTissue::Path::nearest(const Pose
 Pose FollowingTissue::Path::at(const std::vector<std::pair<size_t, double>>& place) const {
     Pose mean{};
     for (const auto& [frame, weight] : place) {
-        for (int i = 0; i < 3; ++i) {
-            for (int j = 0; j < 3; ++j) mean.turn[i][j] += weight * poses_[frame].turn[i][j];
-            mean.origin[i] += weight * poses_[frame].origin[i];
-        }
+        mean.origin = plus(mean.origin, times(poses_[frame].origin, weight));
+        for (int i = 0; i < 3; ++i) mean.turn[i] = plus(mean.turn[i], times(poses_[frame].turn[i], weight));
     }
     for (int step = 0; step < kPolarSteps; ++step) {
-        Rotation transposed, square, cube;
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) transposed[i][j] = mean.turn[j][i];
-        product(mean.turn, transposed, square);
-        product(square, mean.turn, cube);
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) mean.turn[i][j] = 1.5 * mean.turn[i][j] - 0.5 * cube[i][j];
+        const Matrix cube = times(times(mean.turn, transposed(mean.turn)), mean.turn);
+        for (int i = 0; i < 3; ++i) mean.turn[i] = minus(times(mean.turn[i], 1.5), times(cube[i], 0.5));
     }
     return mean;
 }
@@ -145,27 +124,14 @@ FollowingTissue::FollowingTissue(const Scene& scene)
 }
 
 FollowingTissue::Way FollowingTissue::way(const Pose& before, const Pose& after) const {
-    const Vector from = before.at(middle_), to = after.at(middle_);
-    const Vector shift = before.turned_back({to[0] - from[0], to[1] - from[1], to[2] - from[2]});
-    Rotation between;
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j)
-            between[i][j] = before.turn[0][i] * after.turn[0][j] + before.turn[1][i] * after.turn[1][j] +
-                            before.turn[2][i] * after.turn[2][j];
-    const Vector turn = turn_of(between);
+    const Vector shift = before.turned_back(minus(after.at(middle_), before.at(middle_)));
+    const Vector turn = turn_of(times(transposed(before.turn), after.turn));
     return {shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]};
 }
 
 Pose FollowingTissue::moved(const Pose& pose, const Way& way) const {
-    Pose moved;
-    Rotation turn;
-    rotation_of({way[3], way[4], way[5]}, turn);
-    product(pose.turn, turn, moved.turn);
-    const Vector middle = pose.at({middle_[0] + way[0], middle_[1] + way[1], middle_[2] + way[2]});
-    moved.origin = {0, 0, 0};
-    const Vector off = moved.turned(middle_);
-    for (int d = 0; d < 3; ++d) moved.origin[d] = middle[d] - off[d];
-    return moved;
+    const Matrix turn = times(pose.turn, rotation_of({way[3], way[4], way[5]}));
+    return {turn, minus(pose.at(plus(middle_, {way[0], way[1], way[2]})), times(turn, middle_))};
 }
 
 Pose FollowingTissue::at_rest(const Pose& pose) const {

@@ -7,7 +7,7 @@
 namespace ultragray::library {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846, kInfinity = std::numeric_limits<double>::infinity();
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kBeamMm = 2.5, kLeastSliceSigmaMm = 0.1, kLeastSpacingMm = 1e-6, kLeast = 1e-9, kLeastNeedle = 1e-12;
 constexpr double kMostStopped = 1.0 - 1e-6;
 constexpr double kLayers[5] = {-1.2816, -0.5244, 0.0, 0.5244, 1.2816};  // sigma: the middles of fifths of the slice
@@ -64,7 +64,8 @@ Span within_radius(const Vector& place, const Vector& step, double radius) {
 
 // A body's middle and its own axes (rows), in the frame of its points.
 struct Body {
-    Vector middle, axes[3];
+    Vector middle;
+    Matrix axes;
 };
 
 Body body_of(const Box& box) {
@@ -72,20 +73,14 @@ Body body_of(const Box& box) {
     const double norm = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
     const double w = q[0] / norm, x = q[1] / norm, y = q[2] / norm, z = q[3] / norm;
     return {box.centre_mm,
-            {{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
-             {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
-             {2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)}}};
+            {{{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
+              {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
+              {2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)}}}};
 }
 
 Body body_of(const Cylinder& cylinder) {
     const Vector way = minus(cylinder.hub_mm, cylinder.tip_mm), axis = times(way, 1.0 / length(way));
-    int flattest = 0;
-    for (int d = 1; d < 3; ++d)
-        if (std::fabs(axis[d]) < std::fabs(axis[flattest])) flattest = d;
-    Vector unit{};
-    unit[flattest] = 1.0;
-    Vector aside = cross(axis, unit);
-    aside = times(aside, 1.0 / length(aside));
+    const Vector aside = perpendicular(axis);
     return {times(plus(cylinder.tip_mm, cylinder.hub_mm), 0.5), {cross(aside, axis), aside, axis}};
 }
 
@@ -107,7 +102,7 @@ template <class Solid>
 Crossings crossings_of(const Solid& tool, const ScanView& view) {
     const Body body = body_of(tool);
     const Vector middle = view.seen(tool.frame, body.middle);
-    Vector axes[3];
+    Matrix axes;
     for (int d = 0; d < 3; ++d) axes[d] = minus(view.seen(tool.frame, plus(body.middle, body.axes[d])), middle);
     const double face = view.probe.face_mm;
     Crossings found;
@@ -116,9 +111,7 @@ Crossings crossings_of(const Solid& tool, const ScanView& view) {
         std::vector<Crossing>& layers = found.emplace_back();
         for (const double layer : kLayers) {
             const Vector start = plus(minus(line.origin, middle), {0.0, layer * slice, 0.0});
-            Vector place, step;
-            for (int d = 0; d < 3; ++d) place[d] = dot(axes[d], start), step[d] = dot(axes[d], line.along);
-            const Span span = span_of(tool, place, step);
+            const Span span = span_of(tool, times(axes, start), times(axes, line.along));
             double enters = std::max(span.enters, face), path = kLeast;
             const bool met = span.leaves > enters;
             if (met)
@@ -200,21 +193,18 @@ float pulse(float distance, float log_strength = 0.0f) { return std::exp(log_str
 
 ScanView::ScanView(const Probing& probe, const Pose& pose, int width, const std::optional<ElevationBeam>& beam)
     : probe(probe), pose_(pose) {
-    static const double kFwhmPerSigma = 2.0 * std::sqrt(2.0 * std::log(2.0));
     const bool thick = beam && beam->thickness_mm > 0.0;
     sigma_mm_ = (thick ? beam->thickness_mm : kBeamMm) / kFwhmPerSigma;
     focus_mm_ = thick ? beam->focus_mm.value_or(0.0) + probe.face_mm : 0.0;
     rayleigh_mm_ = thick && beam->depth_of_field_mm ? *beam->depth_of_field_mm / 2.0 : kInfinity;
-    Vector origin, direction, ends[2][2];
     for (int j = 0; j < width; ++j) {
-        probe.ray(probe.across(j, width), origin, direction);
-        lines.push_back({origin, direction, {direction[2], 0.0, -direction[0]}});
+        const auto [origin, along] = probe.ray(probe.across(j, width));
+        lines.push_back({origin, along, {along[2], 0.0, -along[0]}});
     }
-    for (int side = 0; side < 2; ++side)
-        probe.ray(probe.start() + probe.span * (0.5 + (side - 0.5) / width), ends[side][0], ends[side][1]);
-    turn = std::acos(std::clamp(dot(ends[0][1], ends[1][1]), -1.0, 1.0));
-    const Vector beside = minus(ends[1][0], ends[0][0]), along = ends[0][1];
-    apart_mm_ = std::fabs(beside[0] * along[2] - beside[2] * along[0]);
+    const auto [origin, along] = probe.ray(probe.start() + probe.span * (0.5 - 0.5 / width));
+    const Ray next = probe.ray(probe.start() + probe.span * (0.5 + 0.5 / width));
+    turn = std::acos(std::clamp(dot(along, next.direction), -1.0, 1.0));
+    apart_mm_ = std::fabs(cross(minus(next.origin, origin), along)[1]);
 }
 
 double ScanView::spacing_mm(double depth) const { return std::max(apart_mm_ + turn * depth, kLeastSpacingMm); }
@@ -227,18 +217,10 @@ Vector ScanView::seen(ToolFrame frame, const Vector& point) const {
     return frame == ToolFrame::Scene ? pose_.turned_back(minus(point, pose_.origin)) : point;
 }
 
-struct ToolsInView::Drawn {
-    int label, first, last;  // columns
-    // [H, last - first + 1] each: share of a pixel that is its body, by its label; of the tissue's echo that gives way to
-    // it; the echo of its surface; share of the beam that it lets through; share of the beam before it that comes back
-    // later.
-    std::vector<float> own, body, echo, passed, tail;
-};
-
 namespace {
 
-template <class Shape, class Drawn>
-bool draw_tool(const Shape& tool, const ScanView& view, int height, Drawn& drawn) {
+template <class Shape>
+bool draw_tool(const Shape& tool, const ScanView& view, int height, DrawnTool& drawn) {
     const Crossings crossings = crossings_of(tool, view);
     drawn.first = -1;
     for (size_t j = 0; j < crossings.size(); ++j)
@@ -291,18 +273,16 @@ bool draw_tool(const Shape& tool, const ScanView& view, int height, Drawn& drawn
 ToolsInView::ToolsInView(const std::vector<Tool>& tools, const ScanView& view, int height)
     : height_(height), width_(int(view.lines.size())) {
     for (const Tool& tool : tools) {
-        Drawn drawn;
+        DrawnTool drawn;
         if (std::visit([&](const auto& one) { return draw_tool(one, view, height, drawn); }, tool))
             drawn_.push_back(std::move(drawn));
     }
 }
 
-ToolsInView::~ToolsInView() = default;
-
 // Of the beam T before it a share `passed` goes on through the tissue behind it, and of what is then heard a share `tail` is
 // the tool once more: T' = T ((1 - tail) passed + tail), and E' is the mean of both echoes by their beams.
 void ToolsInView::draw(Planes& planes) const {
-    for (const Drawn& tool : drawn_) {
+    for (const DrawnTool& tool : drawn_) {
         const int width = tool.last - tool.first + 1;
         for (int row = 0; row < height_; ++row) {
             for (int column = 0; column < width; ++column) {
@@ -325,7 +305,7 @@ void ToolsInView::draw(Planes& planes) const {
 }
 
 void ToolsInView::mark(std::vector<float>& labels) const {
-    for (const Drawn& tool : drawn_) {
+    for (const DrawnTool& tool : drawn_) {
         const int width = tool.last - tool.first + 1;
         for (int row = 0; row < height_; ++row)
             for (int column = 0; column < width; ++column)

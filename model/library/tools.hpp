@@ -10,6 +10,7 @@ namespace ultragray::library {
 // What the kernels draw of a pose, [H, W] each; empty: not drawn.
 struct Planes {
     std::vector<float> bmode, echo, transmittance, coverage;
+    std::array<std::vector<float>*, 4> all() { return {&bmode, &echo, &transmittance, &coverage}; }
 };
 
 // A scan line that meets a tool, or one layer of its slice.
@@ -43,19 +44,26 @@ class ScanView {
     double apart_mm_, sigma_mm_, focus_mm_, rayleigh_mm_;
 };
 
+// What a tool is to the pixels of the columns that it touches.
+struct DrawnTool {
+    int label, first, last;  // columns
+    // [H, last - first + 1] each: share of a pixel that is its body, by its label; of the tissue's echo that gives way to
+    // it; the echo of its surface; share of the beam that it lets through; share of the beam before it that comes back
+    // later.
+    std::vector<float> own, body, echo, passed, tail;
+};
+
 // Tools before the scan lines of a view, in the order in which they are drawn.
 class ToolsInView {
  public:
     ToolsInView(const std::vector<Tool>& tools, const ScanView& view, int height);
-    ~ToolsInView();
     // Draws them into planes; B-mode only beside transmittance.
     void draw(Planes& planes) const;
     // Puts their labels into labels [H, W]; that of the last one where they meet.
     void mark(std::vector<float>& labels) const;
 
  private:
-    struct Drawn;  // what a tool is to the pixels of the columns that it touches
-    std::vector<Drawn> drawn_;
+    std::vector<DrawnTool> drawn_;
     int height_, width_;
 };
 

@@ -1,7 +1,7 @@
 /** Planes of a scene's frames by WebGPU: the plan of the CUDA backend in WGSL (docs/physics.md §8). */
 
 import { common, draw, finish, slice } from "../generated/shaders.js";
-import type { Gaussians, Library, Plan } from "../library.js";
+import { wantedPlanes, type Gaussians, type Library, type Plan } from "../library.js";
 
 const BLOCK = 128; // as in common.wgsl, and so are the tile and the bytes
 const TILE = 16;
@@ -55,7 +55,7 @@ export class GpuRenderer {
 
   /** What `take` makes of the planes that a plan wants, [H, W] one after another, which are there only meanwhile. */
   async render<Result>(view: number, plan: Plan, take: (planes: Float32Array<ArrayBuffer>) => Result): Promise<Result> {
-    const drawing = await this.#drawing(view, plan);
+    const drawing = await kept(this.#drawings, view, () => this.#draws(plan));
     const { size } = drawing.planes;
     const read = drawing.unused.pop() ?? this.device.createBuffer({ size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
     this.device.queue.writeBuffer(drawing.view, 0, this.#view(plan));
@@ -95,18 +95,9 @@ export class GpuRenderer {
     for (const bytes of [BLOCK * SLICE_BYTES, BLOCK * EXTENT_BYTES, BOUNDS_BYTES]) this.#scene.push(this.#storage("the scene", this.#blocks * bytes));
   }
 
-  #drawing(view: number, plan: Plan): Promise<Drawing> {
-    let kept = this.#drawings.get(view);
-    if (kept === undefined) {
-      kept = this.#draws(plan);
-      this.#drawings.set(view, kept);
-    }
-    return kept;
-  }
-
   async #draws(plan: Plan): Promise<Drawing> {
     const { fanned, wrap, height, width } = plan;
-    const pipelines = await this.#compiled(fanned, wrap, plan.beam[0]! > 0);
+    const pipelines = await this.#compiled(fanned, wrap, Number(plan.beam[0]! > 0));
     const [gaussians, harmonics, slices, extents, bounds] = this.#scene as [GPUBuffer, GPUBuffer, GPUBuffer, GPUBuffer, GPUBuffer];
     const tiles = [Math.ceil(width / TILE), Math.ceil(height / TILE)] as [number, number];
     const of = `planes of ${height}x${width} pixels`;
@@ -117,7 +108,7 @@ export class GpuRenderer {
       this.device.queue.writeBuffer(angles, 0, table);
       const sums = this.#storage(of, 12 * height * width);
       const steps = this.#storage(of, 4 * tiles[1] * width);
-      const planes = this.#storage(of, 4 * plan.planes.filter(Boolean).length * height * width);
+      const planes = this.#storage(of, 4 * wantedPlanes(plan).filter(Boolean).length * height * width);
       const bound = [
         [view, gaussians, harmonics, angles, slices, extents, bounds],
         [view, slices, extents, bounds, angles, sums, steps],
@@ -133,32 +124,27 @@ export class GpuRenderer {
   }
 
   /** The passes for scan lines and a slice of some kind, which views share. */
-  #compiled(fanned: boolean, wrap: boolean, thick: boolean): Promise<GPUComputePipeline[]> {
-    const kind = [fanned, wrap, thick].map(Number);
-    let kept = this.#pipelines.get(String(kind));
-    if (kept === undefined) {
-      const { sigmoid, degree } = this.scene;
-      const lines = { FANNED: kind[0]!, WRAP: kind[1]! };
+  #compiled(FANNED: number, WRAP: number, THICK: number): Promise<GPUComputePipeline[]> {
+    return kept(this.#pipelines, `${FANNED}${WRAP}${THICK}`, () => {
       const compile = (code: string, constants: Record<string, number>): Promise<GPUComputePipeline> =>
         this.device.createComputePipelineAsync({ layout: "auto", compute: { module: this.device.createShaderModule({ code: common + code }), constants } });
-      const cut = compile(slice, { ...lines, THICK: kind[2]!, SIGMOID: Number(sigmoid), DEGREE: degree });
-      kept = Promise.all([cut, compile(draw, lines), compile(finish, lines)]);
-      this.#pipelines.set(String(kind), kept);
-    }
-    return kept;
+      const cut = compile(slice, { FANNED, WRAP, THICK, SIGMOID: Number(this.scene.sigmoid), DEGREE: this.scene.degree });
+      return Promise.all([cut, compile(draw, { FANNED, WRAP }), compile(finish, { FANNED, WRAP })]);
+    });
   }
 
   /** The struct View of common.wgsl. */
-  #view({ axes, origin, near, row, most, start, pitch, beam, height, width, planes }: Plan): ArrayBuffer {
+  #view(plan: Plan): ArrayBuffer {
+    const { axes, origin, near_cm, row_cm, most_cm, start, span, beam, height, width } = plan;
     const bytes = new ArrayBuffer(VIEW_BYTES);
     const [a, b, c, d, e, f, g, h, i] = axes as [number, number, number, number, number, number, number, number, number];
     const volume = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g);
     const rounded = origin.map(Math.fround);
     const rest = origin.map((value, at) => value - rounded[at]!);
-    const numbers = [a, b, c, near, d, e, f, row, g, h, i, most, ...rounded, start, ...rest, pitch, ...beam];
+    const numbers = [a, b, c, near_cm, d, e, f, row_cm, g, h, i, most_cm, ...rounded, start, ...rest, span / width, ...beam];
     new Float32Array(bytes).set(numbers.map((value) => Math.min(value, FAR)));
     let place = 0;
-    new Int32Array(bytes, 4 * numbers.length).set(planes.map((wanted) => (wanted ? place++ : -1)));
+    new Int32Array(bytes, 4 * numbers.length).set(wantedPlanes(plan).map((wanted) => (wanted ? place++ : -1)));
     new Float32Array(bytes, 112)[0] = volume;
     new Int32Array(bytes, 116).set([this.scene.count, height, width]);
     return bytes;
@@ -185,9 +171,15 @@ export class GpuRenderer {
   }
 }
 
+/** What a map has at a key: what `make` returns, where there was nothing. */
+function kept<Key, Value>(map: Map<Key, Value>, key: Key, make: () => Value): Value {
+  if (!map.has(key)) map.set(key, make());
+  return map.get(key)!;
+}
+
 /** [2, W, 2]: sine and cosine of each scan line's angle; sine, and 1 - cosine to the last digit, of so many times the pitch. */
-function anglesOf({ start, pitch, width }: Plan): Float32Array<ArrayBuffer> {
-  const table = new Float32Array(4 * width);
+function anglesOf({ start, span, width }: Plan): Float32Array<ArrayBuffer> {
+  const [table, pitch] = [new Float32Array(4 * width), span / width];
   for (let line = 0; line < width; line++) {
     const [angle, turn] = [start + pitch * (line + 0.5), pitch * line];
     table.set([Math.sin(angle), Math.cos(angle)], 2 * line);
