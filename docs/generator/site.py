@@ -36,7 +36,7 @@ DEMO = "demo"  # the folder of the demo scene's page in the site
 def demo_page() -> str:
     """A link for documents in a folder of docs/; the page is no document, whose links would be checked."""
     if page.is_built():
-        return f'<a href="../../{DEMO}/index.html">The demo scene, rendered by your browser</a>'
+        return f'<a href="../{DEMO}/index.html">The demo scene, rendered by your browser</a>'
     return "*(This site was built without `make browser` before, so that the demo scene's page is not part of it.)*"
 
 
