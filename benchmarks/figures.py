@@ -98,6 +98,11 @@ def to_record(name: str, here: str) -> Document:
         raise NotRecordable(f"{staged(name)} is of a quick run; measure it whole with make {TARGETS[name]}")
     if not fresh or ("measured" in fresh and not _is_of(fresh, here)):
         raise NotRecordable(f"{staged(name)} has no figures of commit {here}; measure them with make {TARGETS[name]}")
+    return _beside_kept(name, fresh)
+
+
+def _beside_kept(name: str, fresh: Document) -> Document:
+    """Figures of a file; where it has runs, beside those that are kept of others."""
     return fresh if "measured" in fresh else {**read(kept(name)), **fresh}
 
 
@@ -435,7 +440,7 @@ def show(target: str) -> None:
     """Print the tables of what a target measured."""
     for name, one in BLOCKS.items():
         if TARGETS[one.source] == target and (found := read(staged(one.source))):
-            sys.stdout.write("\n".join((f"# {name}", "", *one.of(found), "", "")))
+            sys.stdout.write("\n".join((f"# {name}", "", *one.of(_beside_kept(one.source, found)), "", "")))
 
 
 def listing() -> Iterator[str]:
