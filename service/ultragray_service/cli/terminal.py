@@ -244,8 +244,10 @@ def progress_bars(*columns: str) -> Iterator[Progress]:
 
 
 @contextlib.contextmanager
-def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A function that is told how many of `total` are done: a bar on a terminal, elsewhere a line every 10 s."""
+def counted(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A function that is told how many of `total` (None: unknown) are done: a bar on a terminal, elsewhere a line every
+    10 s.
+    """
     started = told = time.monotonic()
 
     def tell_done(done: int) -> None:
@@ -254,8 +256,9 @@ def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
         now = time.monotonic()
         if bars.disable and done and now - told >= _TOLD_EVERY_S:
             told = now
-            minutes = (now - started) * (total - done) / done / 60.0
-            typer.echo(f"{what}: {done:,} of {total:,}, {minutes:.1f} min left", err=True)
+            minutes = 0.0 if total is None else (now - started) * (total - done) / done / 60.0
+            of_all = "" if total is None else f" of {total:,}, {minutes:.1f} min left"
+            typer.echo(f"{what}: {done:,}{of_all}", err=True)
 
     with progress_bars("{task.description}", "bar", "of", "left") as bars:
         task = bars.add_task(what, total=total)

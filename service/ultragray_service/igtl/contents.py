@@ -112,6 +112,12 @@ def unpack_transform(content: bytes) -> FloatArray:  # [4, 4] mm
     return _rigid(content, "TRANSFORM")
 
 
+def unpack_matrix(content: bytes) -> FloatArray:  # [4, 4]
+    """The matrix of a TRANSFORM as it is: PLUS sends calibrations of pixels so, which are not rigid."""
+    _check_size("TRANSFORM", content, _MATRIX.itemsize)
+    return _matrix(content)
+
+
 def pack_transform(pose: FloatArray) -> bytes:  # [4, 4]
     return pose[:3].T.astype(">f4").tobytes()
 
@@ -245,10 +251,14 @@ def _check_size(type_name: str, content: bytes, *sizes: int) -> None:
 
 
 def _rigid(values: bytes, what: str) -> FloatArray:
-    pose = np.eye(4)
-    pose[:3] = np.frombuffer(values, ">f4").reshape(4, 3).T
-    exact: FloatArray = check_poses(pose, field=what)[0]
+    exact: FloatArray = check_poses(_matrix(values), field=what)[0]
     return exact
+
+
+def _matrix(values: bytes) -> FloatArray:  # [4, 4]
+    matrix = np.eye(4)
+    matrix[:3] = np.frombuffer(values, ">f4").reshape(4, 3).T
+    return matrix
 
 
 def _placed(values: bytes, what: str) -> FloatArray:
