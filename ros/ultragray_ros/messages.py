@@ -21,6 +21,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
 from ultragray_client import Frame, Placement, Quaternion, ViewPlan, quaternion_from_pose
+from ultragray_client.errors import InvalidArgument
 from ultragray_client.frames import origin_of
 from ultragray_client.recording.messages import geometry_document
 
@@ -65,6 +66,17 @@ def plan_report(plan: ViewPlan) -> String:
     gains = [view.gain for view in plan.views]
     document = {"gains": gains, "before": plan.before, "after": plan.after, "path_m": plan.path_mm / MM_PER_M}
     return String(data=json.dumps(document))
+
+
+def real_pixels(image: Image) -> Pixels:  # [H, W]
+    """The pixels of an image of a probe. Raises InvalidArgument for one that is not grey, of 8 bits."""
+    if image.encoding not in (ENCODING, "8UC1") or len(image.data) != image.height * image.step:
+        raise InvalidArgument(
+            f"real images must be mono8, {image.height} rows of {image.step} bytes, got {len(image.data)} bytes of "
+            f"{image.encoding}",
+            field="image",
+        )
+    return np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)[:, : image.width]
 
 
 def image(pixels: Pixels, header: Header) -> Image:  # [H, W]

@@ -20,8 +20,9 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.time import Time
+from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from ultragray_client import Client, Frame, RenderSettings, Tls
@@ -36,6 +37,7 @@ from ultragray_client.errors import (
     Unimplemented,
 )
 from ultragray_ros.newest import Problems
+from ultragray_ros.real import RealFrames
 from ultragray_ros.topics import Publishers, TransformedPoses
 
 from . import messages, parameters
@@ -58,6 +60,7 @@ OWN_PARAMETERS: dict[str, tuple[Any, str]] = {
         "frames are those of where the probe will be so long after they come, foretold by the stamps of poses; "
         "-1: of the poses as they come",
     ),
+    "recording": ("", "dataset that images of ~/real_image are recorded into, at the poses; empty: none are taken"),
     "timeout_s": (1.0, "frames that are further behind their pose are not published"),
     "autostart": (True, "whether the node configures and activates itself"),
 }
@@ -87,6 +90,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         self._poses: TransformedPoses | None = None
         self._subscription: Any = None
         self._plan_subscription: Any = None
+        self._real: RealFrames | None = None
+        self._image_subscription: Any = None
         self._planner = ThreadPoolExecutor(1, "plan")  # a plan takes a second, in which frames go on
         self._last_pose: PoseStamped | None = None
         self._settings = RenderSettings()
@@ -118,6 +123,7 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             tell=lambda error: self._problems.tell(error.reason, error.detail),
         )
         try:
+            self._record()
             self._take_poses()
             self._plan_subscription = self.create_subscription(PoseStamped, "~/plan_from", self._plan, NEWEST)
         except ClientError as error:
@@ -158,12 +164,15 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
     def _stop(self) -> None:
         if self._poses is not None:
             self._poses.close()
-        for subscription in (self._subscription, self._plan_subscription):
+        for subscription in (self._subscription, self._plan_subscription, self._image_subscription):
             if subscription is not None:
                 self.destroy_subscription(subscription)
         if self._frames is not None:
             self._frames.close()
-        self._poses = self._subscription = self._plan_subscription = self._frames = None
+        if self._real is not None:
+            self._real.close()
+        self._poses = self._subscription = self._plan_subscription = self._image_subscription = None
+        self._frames = self._real = None
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -192,11 +201,39 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             case other:
                 raise InvalidArgument(f"source must be pose or tf, got {other!r}", field="source")
 
+    def _record(self) -> None:
+        """Begin to take real images, where they are to be recorded. Raises InvalidArgument."""
+        if not (name := self._value("recording")):
+            return
+        probe, registration = self._settings.probe, self._settings.registration
+        if probe is None or registration is not None or self._client is None:
+            raise InvalidArgument(
+                "recording takes the probe of the images (probe), and poses of this probe (no registration)",
+                field="recording",
+            )
+        self._real = RealFrames(
+            self._client, name, probe, tell=lambda error: self._problems.tell(error.reason, error.detail)
+        )
+        self._image_subscription = self.create_subscription(
+            Image, "~/real_image", self._take_image, qos_profile_sensor_data
+        )
+
+    def _take_image(self, image: Image) -> None:
+        try:
+            pixels = messages.real_pixels(image)
+        except InvalidArgument as error:
+            self._problems.tell(error.reason, error.detail)
+            return
+        if self._real is not None:
+            self._real.image(Time.from_msg(image.header.stamp).nanoseconds, pixels)
+
     def _take(self, pose: PoseStamped) -> None:
         """A pose came. One that names another frame than the scene's would be taken for what it is not."""
         if not self._is_in_scene(pose):
             return
         self._last_pose = pose
+        if self._real is not None:
+            self._real.pose(Time.from_msg(pose.header.stamp).nanoseconds, messages.placement(pose))
         if self._frames is not None:
             age_ns = (self.get_clock().now() - Time.from_msg(pose.header.stamp)).nanoseconds
             self._frames.render(messages.placement(pose), pose.header, age_ns / 1e9)

@@ -64,12 +64,13 @@ class Peer:
         wait_until(lambda: self.node.count_publishers(f"{NODE}/{topic}"))
         return heard
 
-    def pose(self, stamp, *, y_m=0.0, frame="scene", w=1.0):
+    def pose(self, stamp, *, nanosec=0, y_m=0.0, frame="scene", w=1.0):
         """Publish a pose with a stamp of so many seconds, when the node listens."""
         from geometry_msgs.msg import PoseStamped
 
         message = PoseStamped()
         message.header.frame_id, message.header.stamp.sec = frame, stamp
+        message.header.stamp.nanosec = nanosec
         message.pose.position.y, message.pose.orientation.w = y_m, w
         wait_until(self._poses.get_subscription_count)
         self._poses.publish(message)

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image as Picture
 
 from ultragray_client import Client, Display, PlanSettings, RenderSettings
+from ultragray_workers.datasets.store import open_datasets
 
 from ..surroundings import ROOT
 from ..waiting import wait_until
@@ -96,6 +97,41 @@ def test_a_plan_is_published_for_whoever_asks_where_to_look_next(start_node, pee
     np.testing.assert_allclose(report["gains"], [one.gain for one in wanted.views])
 
 
+def test_real_images_are_recorded_at_the_poses_of_their_stamps(start_node, peer, start_service, tmp_path):
+    from sensor_msgs.msg import Image
+
+    from ultragray_ros.messages import image
+    from ultragray_ros.topics import Header
+
+    service = start_service(artifact_folder=tmp_path)
+    start_node(address=service.grpc, recording="liver", probe="L12-4")
+    images = peer.node.create_publisher(Image, "/ultragray/real_image", 10)
+    wait_until(images.get_subscription_count)
+    seen = np.random.default_rng(0).integers(0, 255, (12, 16), dtype=np.uint8)
+
+    def recorded():
+        recordings = open_datasets(tmp_path, tmp_path).recordings
+        if not recordings.is_open("liver"):
+            return None
+        return next((one for block in recordings.frames("liver") for one in block), None)
+
+    stamps = iter(range(1, 1000))
+
+    def again():
+        """An image between two poses, and what has come of it."""
+        stamp = next(stamps)
+        header = Header()
+        header.stamp.sec, header.stamp.nanosec = stamp, 100_000_000
+        images.publish(image(seen, header))
+        peer.pose(stamp, y_m=0.002)
+        peer.pose(stamp, nanosec=200_000_000, y_m=0.004)
+        return recorded()
+
+    frame = wait_until(again, every_s=0.1)
+    np.testing.assert_array_equal(frame.pixels, seen)
+    np.testing.assert_allclose(frame.pose[:3, 3], (0.0, 3.0, 0.0), atol=1e-9)
+
+
 def test_the_command_of_the_launch_file_starts_the_node(start_node, peer, ros_service):
     from sensor_msgs.msg import Image
 
@@ -172,6 +208,7 @@ def test_the_node_is_a_lifecycle_node(start_node, peer, ros_service):
     ("parameters", "told"),
     [
         ({"source": "radio"}, "source must be pose or tf, got 'radio'"),
+        ({"recording": "liver"}, "recording takes the probe of the images"),
         ({"source": "tf"}, "source must be pose where tf2_ros is not installed"),
         ({"probe": "'{}'"}, "probe must be JSON with a kind"),
         ({"outputs": "['b mode']"}, "outputs must be words such as bmode, got 'b mode'"),

@@ -67,7 +67,8 @@ _COMMANDS = {  # by the panels of the help
     "A running service (--address)": {
         "scenes": (".remote:scenes_app", "List, upload, download, delete and render scenes."),
         "datasets": (".remote:datasets_app", "List, upload and delete the sweeps that trainings use."),
-        "live": (".live:live_app", "Play a sweep into a recording; its scene grows meanwhile."),
+        "live": (".live:live_app", "Record a sweep or a scanner; its scene grows meanwhile."),
+        "recordings": (".remote:recordings_app", "Show, finish and give up recordings."),
         "registrations": (".remote:registrations_app", "List, upload and delete registrations of robots."),
         "jobs": (".jobs:command_app", "Submit, watch and fetch trainings, evaluations and batch renderings."),
         "workers": (".remote:workers_app", "List the workers of the jobs; pause, drain and resume them."),

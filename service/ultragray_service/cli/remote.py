@@ -482,6 +482,19 @@ def _is_hidden(path: Path, folder: Path) -> bool:
     return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
+recordings_app = command_group("Datasets that are still open; `ultragray live` records into one.")
+_recordings = Resource(recordings_app, "recordings", "liver")
+_recordings.add_show("Print how far a recording is.")
+_recordings.add_action(
+    "finish",
+    "Make a recording a dataset, checked as an upload is.",
+    lambda record: (
+        f"recorded {record['name']}: {record['train_frames']} training and {record['val_frames']} held-out frames"
+    ),
+)
+_recordings.add_delete("Give up a recording and its frames.")
+
+
 registrations_app = command_group("Requests that name one have poses in the robot's or tracker's own frame.")
 _registrations = Resource(
     registrations_app,
