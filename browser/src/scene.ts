@@ -216,6 +216,8 @@ class ServedScene implements Scene {
   #waiting = new Map<number, Waiting>();
   #sent = "";
   #latencies_ms: number[] = [];
+  /** Of the newest answer: it aligns the clocks. */
+  #newest: { answer_sent_ms: number; answer_arrived_ms: number } | undefined;
 
   constructor(
     private readonly address: URL,
@@ -236,7 +238,8 @@ class ServedScene implements Scene {
       const rows = [0, 4, 8, 12].map((at) => matrix.slice(at, at + 4));
       const changed = written === this.#sent ? {} : { settings };
       this.#sent = written;
-      const times = { client_time_ms: asked_ms, ...this.#ahead() };
+      const clock = this.#newest && { ...this.#newest, sent_ms: performance.now() };
+      const times = { client_time_ms: asked_ms, clock, ...this.#ahead() };
       socket.send(JSON.stringify({ sequence: this.#sequence, mode: "ordered", pose: { matrix: rows }, ...times, ...changed }));
     });
   }
@@ -263,7 +266,7 @@ class ServedScene implements Scene {
         reject(lost);
         for (const { reject: refuse } of this.#waiting.values()) refuse(lost);
         this.#waiting.clear();
-        this.#socket = undefined; // the next pose opens another
+        this.#socket = this.#newest = undefined; // the next pose opens another
         this.#sent = "";
       };
     });
@@ -276,8 +279,10 @@ class ServedScene implements Scene {
       this.#settle(sequence)?.reject(new Error(error.detail));
       return;
     }
+    const answer_arrived_ms = performance.now();
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
+    this.#newest = { answer_sent_ms: header.sent_ms, answer_arrived_ms };
     const begin = Math.ceil((4 + length) / 8) * 8;
     const waiting = this.#settle(header.sequence);
     if (waiting === undefined) return;

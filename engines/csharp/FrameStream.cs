@@ -38,6 +38,7 @@ namespace Ultragray
         // Of the connection, all written under the exchange's lock:
         CancellationTokenSource connection;
         long sent, acknowledged, settled, refused;
+        double answerSentMs, answerArrivedMs; // of the newest answer, by the service's clock and by this one; 0: none has come
 
         internal FrameStream(Service service, string scene, RenderSettings settings, string name)
         {
@@ -106,6 +107,7 @@ namespace Ultragray
                     connection = open;
                     sent = exchange.Answered;
                     settled = 0;
+                    answerArrivedMs = 0;
                     Listen();
                 }
                 // The thread that sends waits where the caller's need not wake it by a task, which would be garbage.
@@ -170,12 +172,24 @@ namespace Ultragray
                 message.Member("window", Window);
                 // Settings that were refused are not those of the stream: they are sent until a frame of them has come.
                 if (settled < exchange.SetSince) message.Member("settings", exchange.Settings ?? new RenderSettings());
+                message.Member("client_time_ms", NowMs());
                 exchange.Pose.Write(message);
+            }
+            if (answerArrivedMs > 0) // aligns the clocks
+            {
+                message.Name("clock");
+                message.Open('{');
+                message.Member("answer_sent_ms", answerSentMs);
+                message.Member("answer_arrived_ms", answerArrivedMs);
+                message.Member("sent_ms", NowMs());
+                message.Close('}');
             }
             message.Close('}');
             Listen();
             return true;
         }
+
+        static double NowMs() => Stopwatch.GetTimestamp() * 1e3 / Stopwatch.Frequency;
 
         async Task Receive(ClientWebSocket socket, CancellationToken open)
         {
@@ -192,14 +206,14 @@ namespace Ultragray
                 }
                 while (!part.EndOfMessage);
                 if (part.MessageType == WebSocketMessageType.Close) throw new Exception(part.CloseStatusDescription ?? "it was closed");
-                if (part.MessageType == WebSocketMessageType.Binary) ReadFrame(count);
+                if (part.MessageType == WebSocketMessageType.Binary) ReadFrame(count, NowMs());
                 else ReadRefusal(count);
                 lock (exchange) Listen();
             }
         }
 
         /// <summary>Reads a frame: the length of the header (uint32, little endian), the header, the pixels from a multiple of 8 bytes on.</summary>
-        void ReadFrame(int count)
+        void ReadFrame(int count, double arrivedMs)
         {
             var bytes = arriving.Buffer;
             int end = 4 + (bytes[0] | bytes[1] << 8 | bytes[2] << 16 | bytes[3] << 24);
@@ -212,6 +226,8 @@ namespace Ultragray
             silence = FirstSilence;
             lock (exchange)
             {
+                answerSentMs = arriving.Header.SentMs;
+                answerArrivedMs = arrivedMs;
                 settled = Math.Max(settled, sequence);
                 exchange.Publish(sequence, ref arriving);
             }

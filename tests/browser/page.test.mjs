@@ -497,7 +497,7 @@ test("a scene of a service is rendered behind the same interface", async () => {
       const mixed = { height: 40, width: 30, encoding: "float32", outputs: ["labels", "bmode"] };
       const both = await Promise.all([local, served].map((scene) => scene.render(poses[0], mixed)));
       const labelled = both.map((frame) => [frame.pixels("labels").constructor.name, [...frame.pixels("labels")], [...frame.pixels("bmode")]]);
-      return { labelled, most, extrapolations, pixels, doubts, refused, width: again.info.width, same: local.info.image_height === served.info.image_height };
+      return { labelled, most, extrapolations, pixels, doubts, refused, width: again.info.width, clock: again.info.clock, same: local.info.image_height === served.info.image_height };
     });
     assert.ok(apart.most <= 1, `grey values are ${apart.most} apart`);
     for (const [local, served] of apart.extrapolations)
@@ -510,6 +510,7 @@ test("a scene of a service is rendered behind the same interface", async () => {
     for (const doubt of apart.doubts) assert.match(doubt, /has a confidence of 0\.\d\d, 1 is asked for: the nearest/);
     assert.match(apart.refused, /height must be/);
     assert.equal(apart.width, 80);
+    assert.ok(apart.clock, "the clocks are not aligned");
     assert.ok(apart.same);
   } finally {
     await context.close();

@@ -171,6 +171,22 @@ describe("a service that is asked too often", () => {
   });
 });
 
+it("aligns the clocks of page and service", async () => {
+  const page = await openPage(at, "#/scenes");
+  let header = { clock: null };
+  page.on("websocket", (socket) => {
+    socket.on("framereceived", ({ payload }) => {
+      if (typeof payload !== "string") header = JSON.parse(payload.subarray(4, 4 + payload.readUInt32LE(0)).toString());
+    });
+  });
+  await page.goto(`${at.service.url}/#/scan/demo`);
+  const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+  await page.getByLabel("Position Y", { exact: true }).fill("3");
+  await changed(page, first.print);
+  await until(() => header.clock, (clock) => clock !== null, "no offset was told");
+  assert.ok(header.age_ms > 0);
+});
+
 describe("a refused pose", () => {
   for (const reason of ["QUEUE_FULL", "RATE_LIMITED"]) it(`is asked for again where the refusal may pass: ${reason}`, async () => {
     const page = await openPage(at, "#/scenes");

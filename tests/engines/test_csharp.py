@@ -9,6 +9,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from websockets.sync.client import connect
 
 from ultragray import GaussianScene
 from ultragray.contract import from_dict, to_dict
@@ -20,6 +21,7 @@ from ultragray.rendering.tools import Tool
 
 from ..client.proxy import Proxy
 from ..model.library.test_library import Scene, loaded_library, of_python
+from ..service.conftest import split
 from .conftest import HERE
 
 KEY = "0123456789abcdef-engines"
@@ -187,6 +189,22 @@ def test_the_last_of_many_poses_gets_its_frame(driver, start, service):
     for step in range(1, 301):
         program.say("ask", step / 100, 0, 0)
     assert program.wait_for("frame", 300) == f"64 48 - {sha256(rendered(service, (3, 0, 0)).content)}"
+    program.end()
+
+
+def test_a_stream_aligns_the_clocks(driver, start, service):
+    program = start(driver, "frames", "remote", service.http, "demo", KEY)
+    for number in (1, 2):
+        program.say("ask", number, 0, 0)
+        program.wait_for("frame", number)
+    key = {"X-API-Key": KEY}
+    (stream,) = httpx.get(f"{service.http}/v1/streams?scene=demo", headers=key).json()["streams"]
+    watch = f"{service.http.replace('http', 'ws', 1)}/v1/streams/{stream['id']}/watch"
+    with connect(watch, additional_headers=key, max_size=None) as watcher:
+        program.say("ask", 3, 0, 0)
+        header, _ = split(watcher.recv(timeout=300))
+    assert header["clock"] is not None
+    assert header["age_ms"] > 0.0
     program.end()
 
 

@@ -57,6 +57,8 @@ export class FrameStream {
   #silence: ReturnType<typeof setTimeout> | undefined;
   #silent_ms = SILENT_MS.first;
   #sent_ms = -Infinity;
+  /** The newest answer that has come. */
+  #newest: Frame | undefined;
 
   constructor(
     private readonly scene: string,
@@ -93,6 +95,7 @@ export class FrameStream {
     socket.onopen = () => {
       this.#delay_ms = RECONNECT_MS.first;
       this.#sequence = this.#answered = 0;
+      this.#newest = undefined;
       this.#asked.clear();
       this.#sentSettings = this.#takenSettings = "";
       this.#waiting = this.#wanted !== null;
@@ -155,6 +158,7 @@ export class FrameStream {
       timeout_ms: TIMEOUT_MS,
       client_time_ms: performance.now(),
       pose: { ...poseBody(pose), position_mm: null, quaternion: null },
+      ...this.#clock(),
     };
     const known = written === this.#sentSettings && written === this.#takenSettings;
     if (!known) message.settings = { ...settings, encoding: "uint8" };
@@ -175,6 +179,7 @@ export class FrameStream {
       if (PASSING.includes(error.reason)) this.#askAgain();
     } else {
       const frame = decodeFrame(data);
+      this.#newest = frame;
       this.#acknowledge(frame.header.sequence);
       if (frame.header.sequence < this.#answered) return; // a newer pose was refused
       this.#silent_ms = Math.max(SILENT_MS.first, 2 * frame.roundTrip_ms);
@@ -188,8 +193,15 @@ export class FrameStream {
 
   /** Tells the service that an answer was taken: it makes no more frames than the page can show. */
   #acknowledge(sequence: number): void {
-    const message: Partial<Schemas["StreamMessage"]> = { acknowledged: sequence };
+    const message: Partial<Schemas["StreamMessage"]> = { acknowledged: sequence, ...this.#clock() };
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
+  }
+
+  /** What aligns the clocks of page and service. */
+  #clock(): Pick<Partial<Schemas["StreamMessage"]>, "clock"> {
+    if (this.#newest === undefined) return {};
+    const { header, came_ms } = this.#newest;
+    return { clock: { answer_sent_ms: header.sent_ms, answer_arrived_ms: came_ms, sent_ms: performance.now() } };
   }
 
   /** The messages up to this one need no answer any more. */
