@@ -38,6 +38,7 @@ from ultragray_workers.jobs.worker.job_run import JobRun
 RATE_HZ = 10.0
 KILLS = 3
 WITHIN_S, END_S = 3.0, 20.0
+_Following, _Live = live_run.Following, live_run._Live  # as the product has them
 SETS = ("spine_phantom", "ultranerf_liver", "nwire_phantom", "liver_convex")
 
 
@@ -79,7 +80,7 @@ def followed(sweep: Sweep, kills: int) -> list[Version]:
         class Killed(BaseException):
             """As SIGKILL would, it leaves the process no time."""
 
-        class Following(live_run.Following):
+        class Following(_Following):
             """Frames are stored when they are due."""
 
             def next(self, most: int = live_run.MOST_FRAMES) -> Any:
@@ -99,7 +100,7 @@ def followed(sweep: Sweep, kills: int) -> list[Version]:
                     self.dataset = Dataset("sweep", *split_sequence(sweep, len(sweep), None, None))
                 return found
 
-        class Live(live_run._Live):
+        class Live(_Live):
             """Notes what it serves."""
 
             def publish(self, scene: GaussianScene) -> None:

@@ -57,7 +57,7 @@ LEAST_FRAMES = 4  # to train from, before anything is shown
 SURVEY_GROWTH = 1.5
 WINDOW_FRAMES = 6  # about each new one, among which it finds its neighbours
 STILL = 0.25  # of the usual spacing: a frame nearer to one that is there already shows no new place
-RECENT_FRAMES = 16
+RECENT_FRAMES, RECENT_STEPS = 16, 40  # of a new frame, every other is on recent ones; then all are on all frames
 COARSE_STEPS = (60, 20)  # of Gaussians' first: on frames of half the size; of a quarter, which take a third of the time
 COARSE_GAUSSIANS = 0.5  # of the pixels of a frame: with more of them, it is they that take the time
 FLOOR_STEPS = 75  # of a Gaussian's first, in which what lies in a shadow keeps its floor
@@ -91,8 +91,7 @@ class GrowingTrainer:
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
-        self.judged: dict[int, float] = {}  # best PSNR of the versions shown, by held-out frame
-        self._shown: dict[str, Tensor] = {}  # its parameters, and those with which newer Gaussians began
+        self.judged: dict[int, float] = {}  # PSNR of the newest version shown that was judged by a held-out frame
         self._caution = 1.0  # factor on all rates: less after a version that was worse
 
     @property
@@ -118,7 +117,7 @@ class GrowingTrainer:
         """One step, its rates times `rate`, on recent frames or on all of them in turn; the loss."""
         assert self._train is not None
         train, config = self._train, self._config
-        is_recent = self.step % 2 == 0
+        is_recent = self.step % 2 == 0 and self.step - int(self._born.max()) < RECENT_STEPS
         first = max(0, len(train) - RECENT_FRAMES) if is_recent else 0
         own_count = min(config.batch_size - config.batch_size // 2, len(train) - first)
         own = first + torch.randperm(len(train) - first, generator=self._generator)[:own_count]
@@ -186,26 +185,18 @@ class GrowingTrainer:
         return Judgement(psnr_db, ms_ssim)
 
     def is_worse(self, judgement: Judgement) -> bool:
-        """Whether versions that were shown have shown the same frames better by more than LOST_DB."""
+        """Whether the version that is shown shows the same frames better by more than LOST_DB."""
         lost = [self.judged[place] - now for place, now in judgement.psnr_db.items() if place in self.judged]
         return bool(lost) and float(np.mean(lost)) > LOST_DB
 
     def accept(self, judgement: Judgement) -> None:
         """Counts the version of this judgement as the one that is shown."""
-        for place, psnr_db in judgement.psnr_db.items():
-            self.judged[place] = max(psnr_db, self.judged.get(place, psnr_db))
-        self._shown = {name: tensor.detach().cpu().clone() for name, tensor in self._parameters.items()}
+        self.judged |= judgement.psnr_db
         self._caution = min(1.0, REGAINED * self._caution)
 
-    def go_back(self) -> None:
-        """Goes back to the version that is shown, with the Gaussians that began since, and on in smaller steps.
-
-        Steps that are too large for frames with much noise would else keep newer frames from being shown.
-        """
-        if self._shown:  # by this process
-            self._parameters = self._trainable({name: tensor.clone() for name, tensor in self._shown.items()})
-            self._begin_optimizer()
-            self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
+    def slow_down(self) -> None:
+        """Goes on in smaller steps, until versions are shown again: too large ones show noise."""
+        self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
 
     def save(self, path: Path) -> None:
         """Writes all that `restore` goes on from, beside the frames themselves."""
@@ -332,9 +323,6 @@ class GrowingTrainer:
         joined = {name: torch.cat([old[name], one]) if old else one for name, one in start.parameters.items()}
         origin = torch.cat([torch.arange(self.gaussian_count), torch.full((added,), -1)])
         order = spatial_order(joined["means"])
-        if self._shown:
-            begun = {name: torch.cat([self._shown[name], one]) for name, one in start.parameters.items()}
-            self._shown = {name: tensor[order] for name, tensor in begun.items()}
         self._born = torch.cat([self._born, torch.full((added,), self.step)])[order]
         self._floor = torch.cat([self._floor, start.floor])[order]
         self._parameters = self._trainable({name: tensor[order].contiguous() for name, tensor in joined.items()})

@@ -126,10 +126,30 @@ def test_a_version_that_shows_the_same_frames_worse_is_told_from_one_that_does_n
     with torch.no_grad():
         trainer._parameters["sh0"] += 1.0
     assert trainer.is_worse(trainer.judge())
-    trainer.add(sweep.images[12:16], sweep.poses[12:16])
-    trainer.go_back()
-    assert not trainer.is_worse(trainer.judge())
-    trainer.take_step()
+
+
+def test_after_a_version_that_is_worse_steps_are_smaller(sweep):
+    usual, careful = (grown(sweep, until=12) for _ in range(2))
+    careful.slow_down()
+    means = {}
+    for trainer in (usual, careful):
+        before = trainer._parameters["means"].detach().clone()
+        trainer.take_step()
+        means[trainer] = trainer._parameters["means"].detach() - before
+    torch.testing.assert_close(2.0 * means[careful], means[usual], atol=2e-6, rtol=1e-3)
+    careful.accept(careful.judge())
+    assert 0.5 < careful._caution <= 1.0
+
+
+def test_recent_frames_are_learned_first_and_then_all_alike(sweep, monkeypatch):
+    monkeypatch.setattr(growing, "RECENT_FRAMES", 2)
+    monkeypatch.setattr(growing, "RECENT_STEPS", 4)
+    chosen, true_batch = [], growing.Batch.of
+    monkeypatch.setattr(growing.Batch, "of", lambda *a: chosen.append(a[2].tolist()) or true_batch(*a))
+    trainer = grown(sweep, steps=0)
+    for _ in range(8):
+        trainer.take_step()
+    assert [len(own) for own in chosen] == [2, 4, 2, 4, 4, 4, 4, 4]
 
 
 def test_a_version_tells_where_it_holds(sweep):

@@ -16,7 +16,7 @@ import numpy as np
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import HELD_OUT_START, HELD_OUT_STEP, ByteArray, Dataset
-from ultragray.learn.training.growing import LOST_DB, GrowingTrainer
+from ultragray.learn.training.growing import LOST_DB, GrowingTrainer, Judgement
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.datasets.store import DatasetStore, open_datasets
@@ -32,6 +32,7 @@ from ultragray_workers.storage.location import open_storage
 
 CHECKPOINT, JUDGED = "live.safetensors", "judged.json"  # of the folder of the run: the latter of what is served
 CHECKPOINT_EVERY_S = 5.0
+STEPS_A_VERSION = 4.0  # times as long as it takes to judge and serve one
 POLL_S = 0.1  # while nothing is to be done but to wait for frames
 LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
 PAUSE_STEPS = 150  # after which a sweep that goes no further is learned; they become ever smaller
@@ -118,7 +119,7 @@ class _Live:
         self.trainer = GrowingTrainer(job.recording, self.following.probe, device=job_run.request.device)
         self._saved_at_s = self._served_at_s = time.monotonic()
         self._steps_at_last_frame = self._served_step = 0
-        self._steps_per_s = 0.0
+        self._steps_per_s = self._serving_s = 0.0
         self.scene: GaussianScene | None = None  # the version that is served
         self._restore()
 
@@ -153,19 +154,23 @@ class _Live:
 
     def serve(self) -> None:
         """Serves the scene as it is, unless it has become worse."""
+        begun_s = time.monotonic()
         judgement = self.trainer.judge()
-        self._served_at_s, self._served_step = time.monotonic(), self.trainer.step
-        progress = self._run.progress
         if self.trainer.is_worse(judgement):
             sys.stderr.write(f"step {self.trainer.step:,}: not served, for the version before is better\n")
-            self.trainer.go_back()
-            return
+            self.trainer.slow_down()
+        else:
+            self._show(judgement)
+        self._served_at_s, self._served_step = time.monotonic(), self.trainer.step
+        self._serving_s = self._served_at_s - begun_s
+
+    def _show(self, judgement: Judgement) -> None:
         self.scene = self.trainer.scene(judgement)
         self.publish(self.scene)
         self.trainer.accept(judgement)
         self._judged.parent.mkdir(parents=True, exist_ok=True)
         write_whole(self._judged, json.dumps(self.trainer.judged))
-        self._run.progress = replace(progress, val_psnr_db=judgement.mean_psnr_db)
+        self._run.progress = replace(self._run.progress, val_psnr_db=judgement.mean_psnr_db)
         held_out = "" if judgement.mean_psnr_db is None else f", held out {judgement.mean_psnr_db:.2f} dB"
         sys.stderr.write(
             f"step {self.trainer.step:,}, frame {self.trainer.frame_count:,}: a version of "
@@ -189,7 +194,8 @@ class _Live:
 
     def _serve_now_and_then(self) -> None:
         now_s = time.monotonic()
-        if self.trainer.step > self._served_step and now_s - self._served_at_s >= self._job.version_every_s:
+        wait_s = max(self._job.version_every_s, STEPS_A_VERSION * self._serving_s)
+        if self.trainer.step > self._served_step and now_s - self._served_at_s >= wait_s:
             self.serve()
         if self.trainer.is_growing and now_s - self._saved_at_s >= CHECKPOINT_EVERY_S:
             self._save()
