@@ -5,13 +5,12 @@ that it reads. `transport.py` carries them out.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey, Tls
@@ -30,7 +29,6 @@ from ultragray_client.contract import (
     Specification,
 )
 from ultragray_client.conversations import Batch, LastJob, Recorder, RecordingAnswer, Upload, Watch, download_into
-from ultragray_client.errors import InvalidPose
 from ultragray_client.exchange import PoseExchange, StreamMode
 from ultragray_client.frames import (
     Frame,
@@ -39,12 +37,11 @@ from ultragray_client.frames import (
     Slice,
     ViewPlan,
     frame_from_message,
-    localize_message,
-    plan_message,
+    image_fields,
     settings_message,
     slice_from_message,
 )
-from ultragray_client.geometry import PoseLike, pose_message, pose_messages
+from ultragray_client.geometry import PoseLike, matrix_message, pose_message, pose_messages
 from ultragray_client.messages import message_of
 from ultragray_client.records import (
     AuditEntry,
@@ -72,22 +69,12 @@ from ultragray_client.transport import (
     PoseStream,
     Sending,
     Talk,
+    each,
     operation,
 )
 from ultragray_proto.codec import from_message
-from ultragray_proto.v1 import (
-    access_pb2,
-    datasets_pb2,
-    geometry_pb2,
-    jobs_pb2,
-    recordings_pb2,
-    registrations_pb2,
-    rendering_pb2,
-    scenes_pb2,
-    workers_pb2,
-)
+from ultragray_proto.v1 import access_pb2, jobs_pb2, registrations_pb2, scenes_pb2, workers_pb2  # noqa: F401  # whose methods are found by their names
 
-T = TypeVar("T")
 _QUALITY = ("residual_mm", "residual_deg", "position_std_mm", "angle_std_deg")
 
 
@@ -97,23 +84,22 @@ class Scenes(Group[AnyConnection]):
     @operation
     def list(self, *, timeout_s: float | None = None) -> Listing[SceneEntry]:
         """All scenes by name."""
-        request = scenes_pb2.ListScenesRequest()
-        return Listing("SceneService.ListScenes", request, "scenes", entry_from_message, timeout_s)
+        return Listing("SceneService.ListScenes", "scenes", entry_from_message, timeout_s)
 
     @operation
     def get(self, name: str, *, timeout_s: float | None = None) -> Call[Scene]:
         """All that a scene says about itself."""
-        return Call("SceneService.GetScene", scenes_pb2.GetSceneRequest(scene=name), scene_from_message, timeout_s)
+        return Call("SceneService.GetScene", scene_from_message, timeout_s, scene=name)
 
     @operation
     def load(self, name: str, *, timeout_s: float | None = None) -> Call[int]:
         """Loads a scene ahead of its first frame; the number of render processes that hold it."""
-        return Call("SceneService.LoadScene", scenes_pb2.LoadSceneRequest(scene=name), _loaded, timeout_s)
+        return Call("SceneService.LoadScene", _loaded, timeout_s, scene=name)
 
     @operation
     def unload(self, name: str, *, timeout_s: float | None = None) -> Call[int]:
         """Frees a scene's memory; the number of render processes that still hold it."""
-        return Call("SceneService.UnloadScene", scenes_pb2.UnloadSceneRequest(scene=name), _loaded, timeout_s)
+        return Call("SceneService.UnloadScene", _loaded, timeout_s, scene=name)
 
     @operation
     def label(
@@ -140,11 +126,21 @@ class Scenes(Group[AnyConnection]):
         map, into the scene. Raises SceneNotFound, SceneExists, SceneReadOnly, PermissionDenied, InvalidArgument and
         its kinds.
         """
-        asked = {"into": into, "replace": replace, "private": private, "within_mm": within_mm, "probe": probe}
-        known = {"registration": registration, "label_names": dict(label_names or {}), "label_map": label_map}
-        painted = [scenes_pb2.PaintedFrame(pose=pose_message(pose), labels=labels) for pose, labels in frames]
-        request = message_of({**asked, **known}, scenes_pb2.LabelSceneRequest, scene=name, frames=painted)
-        return Call("SceneService.LabelScene", request, scene_from_message, timeout_s)
+        return Call(
+            "SceneService.LabelScene",
+            scene_from_message,
+            timeout_s,
+            asked={"probe": probe},
+            scene=name,
+            into=into,
+            frames=[scenes_pb2.PaintedFrame(pose=pose_message(pose), labels=labels) for pose, labels in frames],
+            label_map=label_map,
+            label_names=dict(label_names or {}),
+            within_mm=within_mm,
+            registration=registration,
+            replace=replace,
+            private=private,
+        )
 
     @operation
     def edit(
@@ -155,8 +151,7 @@ class Scenes(Group[AnyConnection]):
         Raises SceneNotFound, SceneExists, and InvalidArgument with the path of what is wrong.
         """
         asked = {"into": into, "edits": list(edits), "private": private}
-        request = message_of(asked, scenes_pb2.EditSceneRequest, scene=name)
-        return Call("SceneService.EditScene", request, scene_from_message, timeout_s)
+        return Call("SceneService.EditScene", scene_from_message, timeout_s, asked=asked, scene=name)
 
     @operation
     def from_labels(
@@ -166,10 +161,7 @@ class Scenes(Group[AnyConnection]):
 
         Raises SceneExists, and InvalidArgument with the path of what is wrong.
         """
-        asked = {**vars(recipe), "into": into, "private": private}
-        return Call(
-            "SceneService.MakeScene", message_of(asked, scenes_pb2.MakeSceneRequest), scene_from_message, timeout_s
-        )
+        return Call("SceneService.MakeScene", scene_from_message, timeout_s, asked=recipe, into=into, private=private)
 
 
 class Datasets(Group[AnyConnection]):
@@ -202,24 +194,22 @@ class Datasets(Group[AnyConnection]):
     @operation
     def list(self, *, timeout_s: float | None = None) -> Listing[Dataset]:
         """All datasets by name."""
-        request = datasets_pb2.ListDatasetsRequest()
-        return Listing("DatasetService.ListDatasets", request, "datasets", _one(Dataset), timeout_s)
+        return Listing("DatasetService.ListDatasets", "datasets", Dataset, timeout_s)
 
     @operation
     def get(self, name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
         """One dataset."""
-        return Call("DatasetService.GetDataset", datasets_pb2.GetDatasetRequest(dataset=name), _one(Dataset), timeout_s)
+        return Call("DatasetService.GetDataset", Dataset, timeout_s, dataset=name)
 
     @operation
     def contact_sheet(self, name: str, *, timeout_s: float | None = None) -> Call[bytes]:
         """A PNG of the image planes in space and of some frames."""
-        request = datasets_pb2.GetContactSheetRequest(dataset=name)
-        return Call("DatasetService.GetContactSheet", request, lambda answer: bytes(answer.png), timeout_s)
+        return Call("DatasetService.GetContactSheet", lambda answer: bytes(answer.png), timeout_s, dataset=name)
 
     @operation
     def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
         """Raises DatasetInUse where a job needs it."""
-        return Deletion("DatasetService.DeleteDataset", datasets_pb2.DeleteDatasetRequest(dataset=name), timeout_s)
+        return Deletion("DatasetService.DeleteDataset", timeout_s, dataset=name)
 
 
 class Recordings(Group[AnyConnection]):
@@ -232,16 +222,13 @@ class Recordings(Group[AnyConnection]):
         """Begins a recording under the name of the dataset that it becomes; of one that was begun with these settings,
         how far it is. Others do not see a `private` one. Raises DatasetExists, LimitReached.
         """
-        request = recordings_pb2.BeginRecordingRequest(
-            dataset=name, settings=message_of(settings, recordings_pb2.RecordingSettings), private=private
-        )
-        return Call("RecordingService.BeginRecording", request, _one(RecordingView), timeout_s)
+        asked = {"dataset": name, "settings": settings, "private": private}
+        return Call("RecordingService.BeginRecording", RecordingView, timeout_s, asked=asked)
 
     @operation
     def get(self, name: str, *, timeout_s: float | None = None) -> Call[RecordingView]:
         """How far a recording is."""
-        request = recordings_pb2.GetRecordingRequest(dataset=name)
-        return Call("RecordingService.GetRecording", request, _one(RecordingView), timeout_s)
+        return Call("RecordingService.GetRecording", RecordingView, timeout_s, dataset=name)
 
     @operation
     def record(
@@ -258,14 +245,12 @@ class Recordings(Group[AnyConnection]):
     @operation
     def finish(self, name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
         """Makes a recording a dataset, checked as an upload is. Raises DatasetInvalid."""
-        request = recordings_pb2.FinishRecordingRequest(dataset=name)
-        return Call("RecordingService.FinishRecording", request, _one(Dataset), timeout_s)
+        return Call("RecordingService.FinishRecording", Dataset, timeout_s, dataset=name)
 
     @operation
     def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
         """Raises DatasetInUse where a live job follows it."""
-        request = recordings_pb2.DeleteRecordingRequest(dataset=name)
-        return Deletion("RecordingService.DeleteRecording", request, timeout_s)
+        return Deletion("RecordingService.DeleteRecording", timeout_s, dataset=name)
 
 
 class Jobs(Group[AnyConnection]):
@@ -294,13 +279,18 @@ class Jobs(Group[AnyConnection]):
         """
         # With an id of its own a submission that is sent again gives the same job.
         request_id = uuid.uuid4().hex if request_id is None else request_id
-        request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority, private=private)
-        job = getattr(request, specification.kind)
+        job = getattr(jobs_pb2.SubmitJobRequest(), specification.kind)
         poses = getattr(specification, "poses", None)
         others = {} if poses is None else {"poses": pose_messages(poses)}
-        job.MergeFrom(message_of(specification, type(job), **others))
-        job.SetInParent()
-        return Call("JobService.SubmitJob", request, lambda answer: job_from_message(answer.job), timeout_s)
+        return Call(
+            "JobService.SubmitJob",
+            lambda answer: job_from_message(answer.job),
+            timeout_s,
+            **{specification.kind: message_of(specification, type(job), **others)},
+            request_id=request_id,
+            priority=priority,
+            private=private,
+        )
 
     @operation
     def list(
@@ -312,13 +302,13 @@ class Jobs(Group[AnyConnection]):
         timeout_s: float | None = None,
     ) -> Listing[Job]:
         """The newest jobs first, at most `limit`; None: all that the service keeps."""
-        request = message_of({"state": state, "kind": kind}, jobs_pb2.ListJobsRequest)
-        return Listing("JobService.ListJobs", request, "jobs", job_from_message, timeout_s, limit)
+        asked = {"state": state, "kind": kind}
+        return Listing("JobService.ListJobs", "jobs", job_from_message, timeout_s, limit, asked)
 
     @operation
     def get(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
         """One job."""
-        return Call("JobService.GetJob", jobs_pb2.GetJobRequest(job=job_id), job_from_message, timeout_s)
+        return Call("JobService.GetJob", job_from_message, timeout_s, job=job_id)
 
     @operation
     def watch(self, job_id: str, *, timeout_s: float | None = None) -> Talk[JobEvent]:
@@ -336,23 +326,22 @@ class Jobs(Group[AnyConnection]):
     @operation
     def cancel(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
         """Stops a job within a second. Raises JobFinished for one that succeeded or failed."""
-        return Call("JobService.CancelJob", jobs_pb2.CancelJobRequest(job=job_id), job_from_message, timeout_s)
+        return Call("JobService.CancelJob", job_from_message, timeout_s, job=job_id)
 
     @operation
     def retry(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
         """A new job in place of a failed or cancelled one; asked again, the same one. Raises JobNotFinished."""
-        return Call("JobService.RetryJob", jobs_pb2.RetryJobRequest(job=job_id), job_from_message, timeout_s)
+        return Call("JobService.RetryJob", job_from_message, timeout_s, job=job_id)
 
     @operation
     def delete(self, job_id: str, *, timeout_s: float | None = None) -> Call[None]:
         """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
-        return Deletion("JobService.DeleteJob", jobs_pb2.DeleteJobRequest(job=job_id), timeout_s)
+        return Deletion("JobService.DeleteJob", timeout_s, job=job_id)
 
     @operation
     def log(self, job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> Call[str]:
         """The end of what the job's process said."""
-        request = jobs_pb2.GetJobLogRequest(job=job_id, max_bytes=max_bytes)
-        return Call("JobService.GetJobLog", request, lambda answer: str(answer.log), timeout_s)
+        return Call("JobService.GetJobLog", lambda answer: str(answer.log), timeout_s, job=job_id, max_bytes=max_bytes)
 
     @operation
     def download(
@@ -377,22 +366,22 @@ class Workers(Group[AnyConnection]):
     @operation
     def list(self, *, timeout_s: float | None = None) -> Call[tuple[Worker, ...]]:
         """The workers by name, also those that were lost within a day."""
-        return Call("WorkerService.ListWorkers", workers_pb2.ListWorkersRequest(), _each("workers", Worker), timeout_s)
+        return Call("WorkerService.ListWorkers", each("workers", Worker), timeout_s)
 
     @operation
     def pause(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
         """Lets a worker take no more jobs; it ends the one at hand."""
-        return Call("WorkerService.PauseWorker", workers_pb2.PauseWorkerRequest(worker=name), _one(Worker), timeout_s)
+        return Call("WorkerService.PauseWorker", Worker, timeout_s, worker=name)
 
     @operation
     def drain(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
         """As `pause`, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint."""
-        return Call("WorkerService.DrainWorker", workers_pb2.DrainWorkerRequest(worker=name), _one(Worker), timeout_s)
+        return Call("WorkerService.DrainWorker", Worker, timeout_s, worker=name)
 
     @operation
     def resume(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
         """Lets a worker take jobs again."""
-        return Call("WorkerService.ResumeWorker", workers_pb2.ResumeWorkerRequest(worker=name), _one(Worker), timeout_s)
+        return Call("WorkerService.ResumeWorker", Worker, timeout_s, worker=name)
 
 
 class Registrations(Group[AnyConnection]):
@@ -401,14 +390,12 @@ class Registrations(Group[AnyConnection]):
     @operation
     def list(self, *, timeout_s: float | None = None) -> Listing[Registration]:
         """All registrations that the key may see, by name."""
-        request = registrations_pb2.ListRegistrationsRequest()
-        return Listing("RegistrationService.ListRegistrations", request, "registrations", _one(Registration), timeout_s)
+        return Listing("RegistrationService.ListRegistrations", "registrations", Registration, timeout_s)
 
     @operation
     def get(self, name: str, *, timeout_s: float | None = None) -> Call[Registration]:
         """One registration."""
-        request = registrations_pb2.GetRegistrationRequest(registration=name)
-        return Call("RegistrationService.GetRegistration", request, _one(Registration), timeout_s)
+        return Call("RegistrationService.GetRegistration", Registration, timeout_s, registration=name)
 
     @operation
     def put(
@@ -428,17 +415,15 @@ class Registrations(Group[AnyConnection]):
         Raises InvalidPose, SceneNotFound, PermissionDenied, LimitReached.
         """
         links = {"base_to_scene": base_to_scene, "probe_to_flange": probe_to_flange}
-        matrices = {link: _matrix(pose, link) for link, pose in links.items() if pose is not None}
+        matrices = {link: matrix_message(pose, field=link) for link, pose in links.items() if pose is not None}
         known = {key: value for key, value in (quality or {}).items() if key in _QUALITY}
         content = message_of(known, registrations_pb2.Registration, scene=scene, **matrices)
-        request = registrations_pb2.PutRegistrationRequest(registration=name, content=content)
-        return Call("RegistrationService.PutRegistration", request, _one(Registration), timeout_s)
+        return Call("RegistrationService.PutRegistration", Registration, timeout_s, registration=name, content=content)
 
     @operation
     def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
         """Forgets a registration."""
-        request = registrations_pb2.DeleteRegistrationRequest(registration=name)
-        return Call("RegistrationService.DeleteRegistration", request, lambda _: None, timeout_s)
+        return Call("RegistrationService.DeleteRegistration", lambda _: None, timeout_s, registration=name)
 
 
 class _Client(Group[AnyConnection]):
@@ -470,8 +455,8 @@ class _Client(Group[AnyConnection]):
 
         Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
         """
-        request = rendering_pb2.RenderRequest(settings=settings_message(scene, settings), pose=pose_message(pose))
-        return Call("RenderService.Render", request, frame_from_message, timeout_s)
+        asked = {"settings": settings_message(scene, settings), "pose": pose_message(pose)}
+        return Call("RenderService.Render", frame_from_message, timeout_s, **asked)
 
     @operation
     def render_batch(
@@ -534,8 +519,8 @@ class _Client(Group[AnyConnection]):
 
         Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
         """
-        request = rendering_pb2.RenderSliceRequest(scene=scene, slice=message_of(plane, rendering_pb2.SliceSettings))
-        return Call("RenderService.RenderSlice", request, slice_from_message, timeout_s)
+        asked = {"scene": scene, "slice": plane}
+        return Call("RenderService.RenderSlice", slice_from_message, timeout_s, asked=asked)
 
     @operation
     def assess_poses(
@@ -554,13 +539,15 @@ class _Client(Group[AnyConnection]):
         `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
         TooManyPoses.
         """
-        request = message_of(
-            {"probe": probe, "registration": registration},
-            rendering_pb2.AssessPosesRequest,
+        return Call(
+            "RenderService.AssessPoses",
+            each("extrapolations", Extrapolation),
+            timeout_s,
+            asked={"probe": probe},
             scene=scene,
-            poses=list(pose_messages(poses)),
+            poses=pose_messages(poses),
+            registration=registration,
         )
-        return Call("RenderService.AssessPoses", request, _each("extrapolations", Extrapolation), timeout_s)
 
     @operation
     def localize(
@@ -584,8 +571,18 @@ class _Client(Group[AnyConnection]):
         its pose can be used. With a `registration` the start is a pose of the flange in its base, and the answer has
         such a pose as well. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
         """
-        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg, search)
-        return Call("RenderService.Localize", request, _one(Localization), timeout_s)
+        return Call(
+            "RenderService.Localize",
+            Localization,
+            timeout_s,
+            asked={"probe": probe, "search": search},
+            scene=scene,
+            start=None if start is None else pose_message(start, field="start"),
+            registration=registration,
+            within_mm=within_mm,
+            within_deg=within_deg,
+            **image_fields(image),
+        )
 
     @operation
     def plan_views(
@@ -606,13 +603,22 @@ class _Client(Group[AnyConnection]):
         them are poses of the flange in its base, and the planned views have such poses as well. Raises SceneNotFound,
         InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
         """
-        request = plan_message(scene, settings, poses, view, start, registration)
-        return Call("RenderService.PlanViews", request, _one(ViewPlan), timeout_s)
+        return Call(
+            "RenderService.PlanViews",
+            ViewPlan,
+            timeout_s,
+            asked=settings or PlanSettings(),
+            scene=scene,
+            poses=pose_messages(poses),
+            view=None if view is None else pose_message(view, field="view"),
+            start=None if start is None else pose_message(start, field="start"),
+            registration=registration,
+        )
 
     @operation
     def who_am_i(self, *, timeout_s: float | None = None) -> Call[Me]:
         """The name and the role that the key stands for."""
-        return Call("AccessService.WhoAmI", access_pb2.WhoAmIRequest(), _one(Me), timeout_s)
+        return Call("AccessService.WhoAmI", Me, timeout_s)
 
     @operation
     def audit(
@@ -628,8 +634,8 @@ class _Client(Group[AnyConnection]):
 
         For admins alone. Raises PermissionDenied, InvalidArgument.
         """
-        request = access_pb2.ListAuditEntriesRequest(since_hours=since_hours, who=who, what=what, limit=limit)
-        return Call("AccessService.ListAuditEntries", request, _each("entries", AuditEntry), timeout_s)
+        asked = {"since_hours": since_hours, "who": who, "what": what, "limit": limit}
+        return Call("AccessService.ListAuditEntries", each("entries", AuditEntry), timeout_s, **asked)
 
 
 class Client(_Client[Connection]):
@@ -679,23 +685,5 @@ class AsyncClient(_Client[AsyncConnection]):
         await self.close()
 
 
-def _one(cls: type[T]) -> Callable[[Any], T]:
-    return lambda message: from_message(message, cls)
-
-
-def _each(items: str, cls: type[T]) -> Callable[[Any], tuple[T, ...]]:
-    return lambda answer: tuple(from_message(one, cls) for one in getattr(answer, items))
-
-
 def _loaded(answer: Any) -> int:
     return int(answer.loaded_processes)
-
-
-def _matrix(pose: npt.ArrayLike, field: str) -> geometry_pb2.Matrix:
-    try:
-        matrix = np.asarray(pose, np.float64)
-    except (TypeError, ValueError):
-        raise InvalidPose(f"{field} must be numbers [4, 4], got {type(pose).__name__}", field=field) from None
-    if matrix.shape != (4, 4):
-        raise InvalidPose(f"{field} must be [4, 4], got {list(matrix.shape)}", field=field)
-    return geometry_pb2.Matrix(values=matrix.ravel().tolist())

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ultragray_client.connection import error_of_frame
 from ultragray_client.contract import MAX_AHEAD_MS
 from ultragray_client.errors import Draining, InvalidArgument
-from ultragray_client.frames import Frame, frame_from_message, put_image
+from ultragray_client.frames import Frame, frame_from_message, image_fields
 from ultragray_client.geometry import PoseLike, pose_message
 from ultragray_proto.v1 import rendering_pb2
 
@@ -217,9 +217,8 @@ class PoseExchange:
 
     def real(self, image: npt.ArrayLike | bytes, measured_ns: int) -> rendering_pb2.RenderStreamRequest:
         """The message of a real frame. Raises InvalidArgument."""
-        message = rendering_pb2.RenderStreamRequest(real=rendering_pb2.RealFrame(client_time_ns=measured_ns))
-        put_image(message.real, image)
-        return message
+        real = rendering_pb2.RealFrame(client_time_ns=measured_ns, **image_fields(image))
+        return rendering_pb2.RenderStreamRequest(real=real)
 
     def departing(self, message: rendering_pb2.RenderStreamRequest) -> rendering_pb2.RenderStreamRequest:
         """The message, with what aligns the clocks of client and service as it goes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as field_of
 from enum import Enum
@@ -18,15 +18,13 @@ from ultragray_client.contract import (
     ClockOffset,
     Encoding,
     Extrapolation,
-    PlanSettings,
     Prediction,
     Preview,
-    Probe,
     RenderSettings,
     SettingsUsed,
 )
 from ultragray_client.errors import InvalidArgument
-from ultragray_client.geometry import FloatArray, PoseLike, pose_message, pose_messages
+from ultragray_client.geometry import FloatArray, PoseLike, pose_message
 from ultragray_client.messages import message_of
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import recordings_pb2, rendering_pb2
@@ -211,28 +209,6 @@ class ViewPlan:
     plan_ms: float
 
 
-def plan_message(
-    scene: str,
-    settings: PlanSettings | None,
-    poses: Iterable[PoseLike],
-    view: PoseLike | None,
-    start: PoseLike | None,
-    registration: str | None,
-) -> rendering_pb2.PlanViewsRequest:
-    """The request of a plan. Raises InvalidPose."""
-    single = {
-        name: pose_message(pose, field=name) for name, pose in (("view", view), ("start", start)) if pose is not None
-    }
-    return message_of(
-        settings or PlanSettings(),
-        rendering_pb2.PlanViewsRequest,
-        scene=scene,
-        poses=list(pose_messages(poses)),
-        **single,
-        **({} if registration is None else {"registration": registration}),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class RealFrame:
     """A frame as a probe took it: rows along depth, columns across scan lines, not scan-converted."""
@@ -266,36 +242,9 @@ def grey_pixels(image: npt.ArrayLike) -> npt.NDArray[np.uint8]:  # [H, W]
     return pixels
 
 
-def localize_message(
-    scene: str,
-    image: npt.ArrayLike | bytes,
-    start: PoseLike | None,
-    probe: Probe | None,
-    registration: str | None,
-    within_mm: float,
-    within_deg: float,
-    search: str,
-) -> rendering_pb2.LocalizeRequest:
-    """The request of a search. Raises InvalidArgument for what is no grey image, and InvalidPose."""
-    asked = {
-        "probe": probe,
-        "registration": registration,
-        "within_mm": within_mm,
-        "within_deg": within_deg,
-        "search": search,
-    }
-    request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene)
-    if start is not None:
-        request.start.CopyFrom(pose_message(start, field="start"))
-    put_image(request, image)
-    return request
-
-
-def put_image(request: Any, image: npt.ArrayLike | bytes) -> None:
-    """Puts a real frame into a request. Raises InvalidArgument for what is no grey image."""
+def image_fields(image: npt.ArrayLike | bytes) -> dict[str, Any]:
+    """The fields of a request that hold a real frame. Raises InvalidArgument for what is no grey image."""
     if isinstance(image, bytes):
-        request.image = image
-        return
+        return {"image": image}
     pixels = grey_pixels(image)
-    request.image = pixels.tobytes()
-    request.image_height, request.image_width = pixels.shape
+    return {"image": pixels.tobytes(), "image_height": pixels.shape[0], "image_width": pixels.shape[1]}

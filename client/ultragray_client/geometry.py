@@ -46,15 +46,19 @@ def pose_message(pose: PoseLike, *, field: str = "pose") -> geometry_pb2.Pose:
     """Raises InvalidPose for what is not a Placement nor sixteen numbers [4, 4]; the service checks the numbers."""
     if isinstance(pose, Placement):
         return geometry_pb2.Pose(placement=to_message(pose, geometry_pb2.Placement))
+    return geometry_pb2.Pose(matrix=matrix_message(pose, field=field, otherwise="a Placement or "))
+
+
+def matrix_message(pose: npt.ArrayLike, *, field: str, otherwise: str = "") -> geometry_pb2.Matrix:
+    """Raises InvalidPose for what is not sixteen numbers [4, 4]; `otherwise`: what else it may be, in words."""
     try:
-        matrix = np.asarray(pose, dtype=np.float64)
+        matrix = np.asarray(pose, np.float64)
     except (TypeError, ValueError):
-        raise InvalidPose(
-            f"{field} must be a Placement or numbers [4, 4], got {type(pose).__name__}", field=field
-        ) from None
+        got = type(pose).__name__
+        raise InvalidPose(f"{field} must be {otherwise}numbers [4, 4], got {got}", field=field) from None
     if matrix.shape != (4, 4):
-        raise InvalidPose(f"{field} must be a Placement or [4, 4], got {list(matrix.shape)}", field=field)
-    return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=matrix.ravel().tolist()))
+        raise InvalidPose(f"{field} must be {otherwise}[4, 4], got {list(matrix.shape)}", field=field)
+    return geometry_pb2.Matrix(values=matrix.ravel().tolist())
 
 
 def pose_messages(poses: Iterable[PoseLike]) -> Iterator[geometry_pb2.Pose]:

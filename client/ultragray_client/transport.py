@@ -12,11 +12,12 @@ import inspect
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractContextManager, aclosing
-from dataclasses import dataclass
-from types import MethodType
+from dataclasses import dataclass, is_dataclass
+from types import MappingProxyType, MethodType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 import grpc
+from google.protobuf.descriptor import MethodDescriptor
 from google.protobuf.descriptor_pool import Default
 from google.protobuf.message_factory import GetMessageClass
 
@@ -24,7 +25,9 @@ from ultragray_client.connection import CHANNEL_OPTIONS, ApiKey, Metadata, Retri
 from ultragray_client.conversations import Conversation
 from ultragray_client.errors import ClientError, NotFound
 from ultragray_client.exchange import PoseExchange
+from ultragray_client.messages import message_of
 from ultragray_client.stream import AsyncFrameStream, FrameStream
+from ultragray_proto.codec import from_message
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -53,7 +56,7 @@ class Connection(Terms):
     def method(self, name: str) -> Any:
         """A method over the channel, such as "SceneService.GetScene"."""
         if name not in self._methods:
-            found = Default().FindMethodByName(f"ultragray.v1.{name}")
+            found = _described(name)
             words = ("stream" if streams else "unary" for streams in (found.client_streaming, found.server_streaming))
             self._methods[name] = getattr(self._channel, "_".join(words))(
                 f"/{found.containing_service.full_name}/{found.name}",
@@ -159,10 +162,25 @@ async def _read_in_threads(messages: Iterator[T]) -> AsyncIterator[T]:
 
 
 class Call(Generic[T]):
-    """A question with one answer. `timeout_s` is for all attempts together; None: the client's."""
+    """A question with one answer. `timeout_s` is for all attempts together; None: the client's.
 
-    def __init__(self, method: str, request: Any, read: Callable[[Any], T], timeout_s: float | None) -> None:
-        self._method, self._request, self._read, self._timeout_s = method, request, read, timeout_s
+    The request has `fields`, and those of `asked`, in the form that a caller gives them; `read` makes the answer of
+    the message, or is the dataclass that it tells.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        read: Callable[[Any], T] | type[T],
+        timeout_s: float | None,
+        *,
+        asked: object = MappingProxyType({}),
+        **fields: Any,
+    ) -> None:
+        """Raises InvalidArgument for a word that no message has."""
+        self._method, self._timeout_s = method, timeout_s
+        self._request = message_of(asked, GetMessageClass(_described(method).input_type), **fields)
+        self._read = _reading(read)
 
     async def answer(self, connection: Connection) -> T:
         """The answer that a caller gets."""
@@ -184,8 +202,8 @@ class Call(Generic[T]):
 class Deletion(Call[None]):
     """A deletion. What is not found any more where an attempt broke off was deleted by that."""
 
-    def __init__(self, method: str, request: Any, timeout_s: float | None) -> None:
-        super().__init__(method, request, lambda _: None, timeout_s)
+    def __init__(self, method: str, timeout_s: float | None, **fields: Any) -> None:
+        super().__init__(method, lambda _: None, timeout_s, **fields)
 
     async def answer(self, connection: Connection) -> None:
         retries = connection.retries(self._timeout_s, is_short=True)
@@ -202,7 +220,7 @@ class Sending(Call[T]):
     def __init__(
         self, method: str, messages: Callable[[], Iterator[Any]], read: Callable[[Any], T], timeout_s: float | None
     ) -> None:
-        super().__init__(method, None, read, timeout_s)
+        super().__init__(method, read, timeout_s)
         self._messages = messages
 
     async def answer(self, connection: Connection) -> T:
@@ -213,18 +231,18 @@ class Sending(Call[T]):
 
 
 class Listing(Call[tuple[T, ...]]):
-    """A list that comes in pages, at most `limit` of its items. Each page has the timeout for itself."""
+    """A list that comes in pages, at most `limit` of its `items`. Each page has the timeout for itself."""
 
     def __init__(
         self,
         method: str,
-        request: Any,
         items: str,
-        read_item: Callable[[Any], T],
+        read: Callable[[Any], T] | type[T],
         timeout_s: float | None,
         limit: int | None = None,
+        asked: object = MappingProxyType({}),
     ) -> None:
-        super().__init__(method, request, lambda page: tuple(map(read_item, getattr(page, items))), timeout_s)
+        super().__init__(method, each(items, read), timeout_s, asked=asked)
         self._limit = limit
 
     async def answer(self, connection: Connection) -> tuple[T, ...]:
@@ -237,6 +255,24 @@ class Listing(Call[tuple[T, ...]]):
             if not page.next_page_token:
                 break
         return found
+
+
+def each(items: str, read: Callable[[Any], T] | type[T]) -> Callable[[Any], tuple[T, ...]]:
+    """Reads the messages of a list within a message."""
+    read_item = _reading(read)
+    return lambda message: tuple(map(read_item, getattr(message, items)))
+
+
+def _reading(read: Callable[[Any], T] | type[T]) -> Callable[[Any], T]:
+    if not is_dataclass(read):
+        return read
+    cls: Any = read
+    return lambda message: from_message(message, cls)
+
+
+def _described(method: str) -> MethodDescriptor:
+    """The descriptor of a method such as "SceneService.GetScene"."""
+    return Default().FindMethodByName(f"ultragray.v1.{method}")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.editing import SceneEdits
 from ultragray_service.core.jobs import Jobs
-from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -69,7 +68,6 @@ class Service:
     uploads: DatasetUploads
     recordings: OpenRecordings
     imports: SceneImports
-    labels: SceneLabels
     edits: SceneEdits
     # What is made of it.
     pool: RenderPool

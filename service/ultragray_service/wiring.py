@@ -16,7 +16,6 @@ from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.editing import SceneEdits
 from ultragray_service.core.jobs import Jobs
-from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -106,8 +105,7 @@ def make_service(settings: Settings) -> Service:
         uploads=DatasetUploads(datasets, means),
         recordings=OpenRecordings(datasets, means),
         imports=imports,
-        labels=SceneLabels(scenes, imports, registrations, owners, labelling, life),
-        edits=SceneEdits(scenes, imports, owners, editing, life),
+        edits=SceneEdits(scenes, imports, registrations, owners, editing, labelling, life),
         pool=pool,
         planner=planner,
         rendering=rendering,

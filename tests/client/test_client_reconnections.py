@@ -299,5 +299,5 @@ def test_a_deletion_that_had_worked_is_no_error(failures, is_refused):
 
     connection = Failing("127.0.0.1:1", None, None, 60.0)
     with pytest.raises(errors.ClientError) if is_refused else nullcontext():
-        connection.answer(Deletion("JobService.DeleteJob", None, None))
+        connection.answer(Deletion("JobService.DeleteJob", None, job="a"))
     assert not left

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from operator import gt, lt
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -37,9 +37,6 @@ from ultragray_service.cli.terminal import (
     warn,
     working,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 @single("ultragray demo -o demo.ugr", "ultragray demo abdomen -o abdomen.ugr", "ultragray serve demo.ugr")

@@ -31,8 +31,7 @@ from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings
 from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
 from ultragray.scene.edits import Edit
 from ultragray_service.core.clocks import ClockStamps
-from ultragray_service.core.editing import EditTarget, RecipeTarget
-from ultragray_service.core.labelling import LabelTarget, check_painted_count
+from ultragray_service.core.editing import EditTarget, LabelTarget, RecipeTarget, check_painted_count
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.recordings import MAX_NUMBER, IncomingFrame
 from ultragray_service.core.streams import MAX_POSE_BYTES, MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode

@@ -22,9 +22,8 @@ from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, recordings_pb2
 from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_service.access.principals import Me, me
-from ultragray_service.core.editing import EditTarget, RecipeTarget
+from ultragray_service.core.editing import EditTarget, LabelTarget, RecipeTarget
 from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
-from ultragray_service.core.labelling import LabelTarget
 from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, record
 from ultragray_service.core.registrations import NamedRegistration
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
@@ -163,11 +162,11 @@ async def _label_scene(service: Service, request: Any) -> Any:
     if request.label_map:
         if request.frames:
             raise InvalidArgument("either frames or label_map must be given, not both", field="label_map")
-        return await service.labels.by_map(request.scene, target, request.label_map, whose.registration)
+        return await service.edits.label_by_map(request.scene, target, request.label_map, whose.registration)
     frames = [
         (read_pose(frame.pose, f"frames[{index}].pose"), frame.labels) for index, frame in enumerate(request.frames)
     ]
-    return await service.labels.by_frames(request.scene, target, frames, whose.probe, whose.registration)
+    return await service.edits.label_by_frames(request.scene, target, frames, whose.probe, whose.registration)
 
 
 CALLS: Mapping[str, Call] = {

@@ -174,7 +174,7 @@ async def label_scene(request: Request, service: ServiceDep, scene: SceneName) -
         (one.pose.exact(f"frames[{index}].pose"), _bytes_of(one.labels, f"frames[{index}].labels"))
         for index, one in enumerate(body.frames)
     ]
-    work = service.labels.by_frames(scene, body, frames, body.probe, body.registration)
+    work = service.edits.label_by_frames(scene, body, frames, body.probe, body.registration)
     return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
 
 
@@ -183,7 +183,7 @@ async def label_scene_by_map(request: Request, service: ServiceDep, scene: Scene
     """Labels the Gaussians of a scene by a NIfTI label map. The scene itself stays as it is."""
     body = await read_json_body(request, LabelMapBody, LABEL_MAP)
     nifti = await asyncio.to_thread(_bytes_of, body.label_map, "label_map")
-    work = service.labels.by_map(scene, body, nifti, body.registration)
+    work = service.edits.label_by_map(scene, body, nifti, body.registration)
     return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
 
 
