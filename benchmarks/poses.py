@@ -10,9 +10,8 @@ import numpy as np
 
 from measuring import Document, Lines, measure_runs, table
 from ultragray.datasets.source import load_dataset
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import about_axes, random_directions
+from ultragray.geometry.rotations import about_axes, random_directions, rotation_angles_deg
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.alignment import sweep_ranges

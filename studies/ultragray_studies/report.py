@@ -14,9 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from ultragray.errors import UltragrayError
-from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import turns_of
+from ultragray.geometry.rotations import mean_axes, turns_of
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
 from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines
 from ultragray.learn.evaluation.metrics import FrameMetrics

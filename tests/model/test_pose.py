@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ultragray import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.rotations import rotation_angles_deg
 
 
 def turned_about_z(degrees):

@@ -8,8 +8,8 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument, LowConfidence
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
-from ultragray.geometry.rotations import rotations_of, turns_of
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.rotations import rotation_angles_deg, rotations_of, turns_of
 from ultragray.samplers import (
     AroundSampler,
     CoveredSampler,

@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay, goes_to_and_fro_mm
 from ultragray.datasets.images import CropBox
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import Fan, FloatArray, Probe
-from ultragray.geometry.rotations import turns_of
+from ultragray.geometry.rotations import rotation_angles_deg, turns_of
 from ultragray.learn.sweep import Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list
 from ultragray.learn.training.agreement import agreed_path
 

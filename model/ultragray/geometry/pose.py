@@ -147,22 +147,3 @@ def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
     q = products / np.linalg.norm(products)
     w, x, y, z = (float(v) for v in (q if q[0] >= 0 else -q))
     return w, x, y, z
-
-
-def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
-    """Angle of the rotation from one probe orientation to the other, in degrees."""
-    return np.degrees(turn_angles_rad(poses[:, None, :3, :3], others[None, :, :3, :3]))
-
-
-def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3, 3] both -> [...]
-    """Angle of the rotation from one to the other; shapes broadcast."""
-    half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
-    radians: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
-    return radians
-
-
-def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
-    """The rotation nearest to the mean of the poses' rotations."""
-    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return rotation

@@ -1,6 +1,8 @@
-"""Rotations of many poses at once."""
+"""Rotations of many poses at once, and the angles between them."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -41,6 +43,25 @@ def turns_of(rotations: FloatArray) -> FloatArray:  # [C, 3, 3] -> [C, 3] rad
     """Axis times angle, at most π, of each rotation."""
     axes, angles = _axes_and_angles(rotations)
     return axes * angles[:, None]
+
+
+def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
+    """Angle of the rotation from one probe orientation to the other, in degrees."""
+    return np.degrees(turn_angles_rad(poses[:, None, :3, :3], others[None, :, :3, :3]))
+
+
+def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3, 3] both -> [...]
+    """Angle of the rotation from one to the other; shapes broadcast."""
+    half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
+    radians: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
+    return radians
+
+
+def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
+    """The rotation nearest to the mean of the poses' rotations."""
+    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation
 
 
 def _axes_and_angles(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:  # [C, 3, 3] -> [C, 3], [C] rad in [0, π]

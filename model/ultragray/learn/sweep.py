@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.rotations import rotation_angles_deg
 
 
 @dataclass(frozen=True)

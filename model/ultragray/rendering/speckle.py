@@ -30,8 +30,8 @@ import torch
 from torch import Tensor
 
 from ultragray import _cpu
-from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.rotations import mean_axes
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
 

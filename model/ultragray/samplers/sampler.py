@@ -11,9 +11,9 @@ import numpy as np
 
 from ultragray.contract import Family, described, kind_field
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses, rotation_angles_deg, turn_angles_rad
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.geometry.rotations import about_axes, blended, random_directions
+from ultragray.geometry.rotations import about_axes, blended, random_directions, rotation_angles_deg, turn_angles_rad
 
 MAX_POSES = 100_000  # that are made at once
 MAX_DRAWN = 100_000_000  # of a batch that is made in shards: 20,000 files of 5,000 frames

@@ -18,9 +18,8 @@ import cv2
 import numpy as np
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import blended
+from ultragray.geometry.rotations import blended, rotation_angles_deg
 from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.rendering.display import AS_RENDERED

@@ -17,9 +17,9 @@ from torch import Tensor
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, InvalidImageSize
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import BoolArray, FloatArray, Probe
-from ultragray.geometry.rotations import about_axes, random_directions, rotations_of
+from ultragray.geometry.rotations import about_axes, random_directions, rotation_angles_deg, rotations_of
 from ultragray.rendering.confidence import supported_shares
 from ultragray.rendering.contact import Touch
 from ultragray.rendering.frames import render, touch_of

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import mean_axes
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods.method import Description
 from ultragray_studies.methods.parts import PUBLISHED_FRAMES, EpochMethod, SliceLearner, as_tensor, encode, encoded_size

@@ -10,7 +10,7 @@ from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.rotations import rotation_angles_deg
 
 from .conftest import DEVICE_SET
 from .test_fan import FAN, of_both, screen

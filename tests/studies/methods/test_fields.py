@@ -8,7 +8,7 @@ import torch
 
 from ultragray import ConvexProbe
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import mean_axes
+from ultragray.geometry.rotations import mean_axes
 from ultragray.learn.evaluation.baselines import predict
 from ultragray.learn.evaluation.methods import NAMES
 from ultragray_studies.methods.implicitvol import (

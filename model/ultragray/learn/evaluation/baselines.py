@@ -21,8 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses, mean_axes
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.rotations import mean_axes
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
 from ultragray.learn.prediction import NeighboursInTime, blend_by_distance, seen_by_frame
 from ultragray.learn.sweep import (

@@ -35,8 +35,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.planning.reach import evenly_spread, poses_in_reach
 from ultragray.learn.planning.settings import MAX_LISTED, MAX_PATH_MM, PlanSettings, ViewPlan, box_of
 from ultragray.learn.sweep import IntArray, corner_distances_mm, spread_places

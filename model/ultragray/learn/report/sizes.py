@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.geometry.pose import turn_angles_rad
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import turn_angles_rad
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.geometry.rotations import blended, rotations_of, turns_of
+from ultragray.geometry.rotations import blended, mean_axes, rotations_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_sharply
 from ultragray.learn.prediction import blend_by_distance, blend_in_time, frame_times, seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places

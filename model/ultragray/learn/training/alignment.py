@@ -22,9 +22,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import rotations_of, turns_of
+from ultragray.geometry.rotations import mean_axes, rotations_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
 from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 

@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from ultragray import _cpu
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray, Lines, ParallelLines, Probe
-from ultragray.geometry.rotations import blended
+from ultragray.geometry.rotations import blended, rotation_angles_deg
 from ultragray.learn.sweep import IntArray, Sweep, spread_places
 from ultragray.rendering.backends import cuda
 

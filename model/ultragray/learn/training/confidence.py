@@ -24,8 +24,8 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep, rendered_parts

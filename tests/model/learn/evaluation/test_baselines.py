@@ -9,7 +9,7 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, Steere
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.geometry.pose import mean_axes
+from ultragray.geometry.rotations import mean_axes
 from ultragray.learn.evaluation import baselines as compounding
 from ultragray.learn.evaluation.baselines import (
     BASELINES,

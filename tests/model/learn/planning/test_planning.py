@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ultragray import LinearProbe, PlanSettings, plan_views
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.planning.reach import LEAST_CONTACT, poses_in_reach
 from ultragray.learn.planning.search import choose, distances_mm, exchange, shortest_path
 from ultragray.learn.sweep import corner_distances_mm

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch.nn import functional
 
-from ultragray.geometry.pose import pose_from_position_quaternion, rotation_angles_deg
+from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
+from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.evaluation.baselines import interpolate_planes, predict
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Sweep
