@@ -8,8 +8,9 @@ planes; air, tools and ghosts put into them) → outputs (`ultragray.rendering.o
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from enum import Enum
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ from ultragray.rendering.tools import ScanView, Tool
 from ultragray.scene.confidence import SUPPORT_COVERAGE
 from ultragray.scene.gaussians import GaussianScene
 
+_Word = TypeVar("_Word", bound=Enum)
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
 _LARGEST_CACHED_PICTURE = 2**20  # pixels
 
@@ -134,7 +136,7 @@ def render(
         int(height),
         int(width),
     )
-    contact = _checked_contact(contact)
+    contact = None if contact is None else _one_of(Contact, contact, "contact", ", or None")
     check_indentation(indentation_mm, contact)
     touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
     pressing = None
@@ -145,7 +147,9 @@ def render(
     chosen_backend = choose_backend(backend, scene)
     draw = BACKENDS[chosen_backend].draw
     scene.check_displacements(len(view[1]))
-    speckle_by = chosen_backend if _checked_speckle(speckle, scene) is Speckle.NATURAL else None
+    speckle = _one_of(Speckle, speckle, "speckle")
+    check_speckle(speckle, scene.info)
+    speckle_by = chosen_backend if speckle is Speckle.NATURAL else None
     shown = beam_cm(scene.info.beam if beam is None else beam, view[0])
     sight = _tools_in_view(tools, view, poses, shown)
     touching = None if touch is None else touch.lines
@@ -165,24 +169,12 @@ def _tools_in_view(tools: Sequence[Tool], view: View, poses: Any, beam: Tensor |
     return ToolsInView(tools, ScanView(probe, poses_mm, width, (sigma, focus, rayleigh)))
 
 
-def _checked_contact(contact: Any) -> Contact | None:
-    if contact is None:
-        return None
+def _one_of(kind: type[_Word], value: Any, field: str, otherwise: str = "") -> _Word:
     try:
-        return Contact(contact)
+        return kind(value)
     except ValueError:
-        words = ", ".join(one.value for one in Contact)
-        raise InvalidArgument(f"contact must be one of {words}, or None, got {contact!r}", field="contact") from None
-
-
-def _checked_speckle(speckle: Any, scene: GaussianScene) -> Speckle:
-    try:
-        chosen = Speckle(speckle)
-    except ValueError:
-        words = ", ".join(one.value for one in Speckle)
-        raise InvalidArgument(f"speckle must be one of {words}, got {speckle!r}", field="speckle") from None
-    check_speckle(chosen, scene.info)
-    return chosen
+        words = ", ".join(one.value for one in kind)
+        raise InvalidArgument(f"{field} must be one of {words}{otherwise}, got {value!r}", field=field) from None
 
 
 def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
@@ -247,16 +239,11 @@ def render_shown(
             return {"bmode": grey}
     frames = render(
         scene,
-        settings.probe,
-        poses,
-        height=settings.height,
-        width=settings.width,
+        poses=poses,
         outputs=names if support is None else (*names, "coverage"),
         backend=backend,
         limits=limits,
-        beam=settings.beam,
-        contact=settings.contact,
-        indentation_mm=settings.indentation_mm,
+        **_plane_settings(settings),
         tools=settings.tools,
         ghost=settings.ghost,
         speckle=settings.speckle,
@@ -291,20 +278,13 @@ def recorded_coverage(
     recorded = recorded_part(scene)
     if recorded is None:
         return scene.means.new_zeros((len(poses), settings.height, settings.width))
-    frames = render(
-        recorded,
-        settings.probe,
-        poses,
-        height=settings.height,
-        width=settings.width,
-        outputs=("coverage",),
-        backend=backend,
-        limits=limits,
-        beam=settings.beam,
-        contact=settings.contact,
-        indentation_mm=settings.indentation_mm,
-    )
-    return frames["coverage"]
+    shown = _plane_settings(settings)
+    return render(recorded, poses=poses, outputs=("coverage",), backend=backend, limits=limits, **shown)["coverage"]
+
+
+def _plane_settings(settings: Resolved) -> dict[str, Any]:
+    """What decides which tissue a frame shows, as `render` takes it."""
+    return {name: getattr(settings, name) for name in ("probe", "height", "width", "beam", "contact", "indentation_mm")}
 
 
 def _is_plain(settings: Resolved) -> bool:
