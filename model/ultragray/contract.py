@@ -182,6 +182,14 @@ def _annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
     return tuple((item, hints[item.name]) for item in fields(cls) if item.init)
 
 
+def made_of(cls: type[_T], *sources: object, **others: Any) -> _T:
+    """The dataclass with `others`, and with what sources have under the names of its fields, the first that has one."""
+    one: Any = cls
+    names = [item.name for item in fields(one) if item.init and item.name not in others]
+    found = {name: getattr(source, name) for name in names for source in sources[::-1] if hasattr(source, name)}
+    return cls(**found, **others)
+
+
 def optional_of(annotation: Any) -> tuple[Any, bool]:
     """The type that an annotation allows beside None, and whether it allows None."""
     if get_origin(annotation) in (Union, UnionType):

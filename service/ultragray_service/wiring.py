@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from functools import partial
 from typing import Any
 
+from ultragray.contract import made_of
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import EnvironmentKeys, Guard, Sessions
 from ultragray_service.access.keys import KnownKeys
@@ -129,8 +129,7 @@ def make_service(settings: Settings) -> Service:
 
 
 def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tracing | None) -> RenderPool:
-    same = {item.name: getattr(settings, item.name) for item in fields(PoolConfig) if hasattr(settings, item.name)}
-    config = PoolConfig(**same, memory_budget_bytes=settings.memory_budget_mb * 2**20)
+    config = made_of(PoolConfig, settings, memory_budget_bytes=settings.memory_budget_mb * 2**20)
 
     def observe(result: RenderResult[Any]) -> None:
         metrics.observe_result(result)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.contract import made_of
 from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay, goes_to_and_fro_mm
 from ultragray.datasets.images import CropBox
 from ultragray.geometry.probe import Fan, FloatArray, Probe
@@ -226,11 +227,11 @@ def check_sweep(sweep: Sweep) -> SweepReport:
     axial_mm, lateral_mm = sweep.pixel_mm
     origins = sweep.poses[:, :3, 3]
     turns = turns_of(sweep.poses[len(sweep) // 2, :3, :3].T @ sweep.poses[:, :3, :3])
-    return SweepReport(
-        source=sweep.source,
+    return made_of(
+        SweepReport,
+        sweep,
+        swept,
         frames=len(sweep),
-        height=sweep.height,
-        width=sweep.width,
         pixel_axial_mm=axial_mm,
         pixel_lateral_mm=lateral_mm,
         extent_min_mm=_vector(corners.min(axis=(0, 1))),
@@ -241,9 +242,6 @@ def check_sweep(sweep: Sweep) -> SweepReport:
         step_max_deg=float(steps_deg.max(initial=0.0)),
         tilt_deg=float(rotation_angles_deg(thinned, thinned).max()),
         tilt_range_deg=_vector(np.ptp(np.degrees(turns), axis=0)),
-        swept_ml=swept.swept_ml,
-        coverage=swept.coverage,
-        voxel_mm=swept.voxel_mm,
         warnings=tuple(_warnings(frames)),
     )
 

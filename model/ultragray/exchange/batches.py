@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.contract import to_dict
+from ultragray.contract import made_of, to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
@@ -103,7 +103,7 @@ class BatchPlan:
             frames = len(sampler.poses(base, resolved.probe))
         shard_frames = shard_frames or SHARD_FRAMES
         plan = cls(
-            settings=FrameSettings(**{one.name: getattr(settings, one.name) for one in fields(FrameSettings)}),
+            settings=made_of(FrameSettings, settings),
             sampler=sampler,
             poses=None if poses is None else base,
             frames=frames,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.contract import Contract, described, to_dict
+from ultragray.contract import Contract, described, made_of, to_dict
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
 from ultragray.geometry.probe import MAX_THICKNESS_MM, PLANE, ElevationBeam, Picture, Probe
@@ -347,19 +347,13 @@ class SettingsUsed(Additions):
 
 @lru_cache(maxsize=256)
 def settings_used(settings: Resolved) -> SettingsUsed:
-    picture = settings.picture
-    return SettingsUsed(
-        probe=settings.probe,
+    return made_of(
+        SettingsUsed,
+        settings.picture,  # whose height and width are those of what is shown
+        settings,
         slice_thickness_mm=settings.beam.thickness_mm,
         rendered_height=settings.height,
         rendered_width=settings.width,
-        display=settings.display,
-        height=picture.height,
-        width=picture.width,
-        picture=picture,
-        outputs=settings.outputs,
-        encoding=settings.encoding,
-        **{one.name: getattr(settings, one.name) for one in fields(Additions)},
     )
 
 

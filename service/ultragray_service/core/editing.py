@@ -8,11 +8,11 @@ from __future__ import annotations
 import asyncio
 import base64
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from ultragray.contract import Contract, described, to_dict
+from ultragray.contract import Contract, described, made_of, to_dict
 from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.scene.edits import MAX_EDITS, Edit, check_edits, scenes_named
@@ -110,8 +110,8 @@ class SceneEdits:
         self._begin(target)
 
         async def make(made: Path, replaced: Path | None) -> None:
-            recipe = {item.name: to_dict(getattr(target, item.name)) for item in fields(SceneRecipe)}
-            await _run(self._editing, make_scene_file, {"output": str(made), "recipe": recipe}, "making the scene")
+            arguments = {"output": str(made), "recipe": to_dict(made_of(SceneRecipe, target))}
+            await _run(self._editing, make_scene_file, arguments, "making the scene")
 
         return await self._made(target, make)
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import Self
 
-from ultragray.contract import Contract, described
+from ultragray.contract import Contract, described, made_of
 from ultragray.errors import InvalidArgument, InvalidPose, TooManyPoses
 from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
@@ -177,16 +177,7 @@ class SliceFacts:
     @classmethod
     def of(cls, result: RenderResult[SliceView]) -> SliceFacts:
         view = result.settings
-        return cls(
-            scene=result.scene,
-            scene_sha256=result.scene_sha256,
-            field=view.field,
-            height=view.height,
-            width=view.width,
-            encoding=view.encoding,
-            pixel_to_scene=view.grid(result.poses[0]).affine,
-            **_timings(result),
-        )
+        return made_of(cls, view, result, pixel_to_scene=view.grid(result.poses[0]).affine, **_timings(result))
 
     @property
     def timings(self) -> SliceFacts:

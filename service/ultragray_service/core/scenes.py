@@ -17,7 +17,7 @@ from pathlib import Path
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ultragray.contract import described
+from ultragray.contract import described, made_of
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.geometry.probe import ElevationBeam, Probe
 from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS
@@ -316,31 +316,22 @@ class Scene:
     @classmethod
     def of(cls, name: str, header: SceneHeader, loaded_processes: int, ownership: Ownership) -> Scene:
         info, model = header.info, read_model(header.info.confidence, len(header.training_poses))
-        return cls(
+        return made_of(
+            cls,
+            info,
+            header,
+            ownership,
             name=name,
             loaded=loaded_processes > 0,
             loaded_processes=loaded_processes,
-            file_bytes=header.file_bytes,
-            gaussian_count=info.gaussian_count,
-            sh_degree=info.sh_degree,
-            intensity=info.intensity,
             centre_mm=Position.of(info.centre_mm),
             bounds=Bounds(Position.of(info.bounds_min_mm), Position.of(info.bounds_max_mm)),
-            probe=info.probe,
-            image_height=info.image_height,
-            image_width=info.image_width,
             training_poses=TrainingPoses.of(header),
-            metrics=header.info.metrics,
             dataset_name=None if info.dataset_name is None else str(info.dataset_name),
             dataset_sha256=None if info.dataset_sha256 is None else str(info.dataset_sha256),
             outputs=[name for name, output in OUTPUTS.items() if output.lacks(info) is None],
-            label_names=info.label_names,
-            beam=info.beam,
             confidence=None if model is None else ConfidenceFit(model.error, model.fitted_on),
             speckle=info.speckle is not None,
-            motion=info.motion,
-            owner=ownership.owner,
-            private=ownership.private,
             parents=info.provenance.get("parents", {}),
             edits=[json.dumps(edit) for edit in info.provenance.get("edits", ())],
             made_labels=[info.label_names[label] for label in info.made_labels],

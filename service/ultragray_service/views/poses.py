@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.contract import described
+from ultragray.contract import described, made_of
 from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.pixels import EncodedFrame
@@ -100,12 +100,10 @@ class Located:
     def of(cls, result: SearchResult[Localization], plan: Plan) -> Located:
         found = result.found
         in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
-        same = ("similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg")
-        return cls(
-            **{name: getattr(found, name) for name in same},
-            scene=result.scene,
-            scene_sha256=result.scene_sha256,
-            renderer=result.renderer,
+        return made_of(
+            cls,
+            found,
+            result,
             pose=found.pose.tolist(),
             flange_to_base=None if in_base is None else in_base.tolist(),
             registration=plan.settings.registration,
@@ -223,13 +221,11 @@ class Planned:
             )
             for pose, gain, rank in zip(found.poses, found.gains.tolist(), found.ranks.tolist(), strict=True)
         ]
-        return cls(
-            scene=result.scene,
-            scene_sha256=result.scene_sha256,
+        return made_of(
+            cls,
+            found,
+            result,
             views=views,
-            before=found.before,
-            after=found.after,
-            path_mm=found.path_mm,
             registration=plan.settings.registration,
             queue_ms=round(result.queue_ms, 3),
             plan_ms=round(result.search_ms, 3),

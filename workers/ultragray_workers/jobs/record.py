@@ -13,7 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ultragray.contract import described
+from ultragray.contract import described, made_of
 from ultragray_workers.jobs.demand import LivingWorker, demand_of_key, waits_for
 from ultragray_workers.jobs.kinds import KINDS
 from ultragray_workers.jobs.owners import Ownership
@@ -98,26 +98,16 @@ def job_of(row: Row, workers: Sequence[LivingWorker]) -> Job:
     if outcome is None:
         outcome = Outcome(progress=row.progress or Progress(), attempts=row.attempt)
     waits = waits_for(demand_of_key(row.demand), workers) if row.state is JobState.QUEUED else None
-    return Job(
-        id=row.id,
-        kind=row.kind,
-        state=row.state,
-        request_id=row.request_id,
+    return made_of(
+        Job,
+        row,
+        outcome,
         specification={name: value for name, value in row.summary.items() if name != "kind"},
-        priority=row.priority,
         created_at=_iso(row.created_ms),
         started_at=None if row.started_ms is None else _iso(max(row.created_ms, row.started_ms)),
         finished_at=None if row.finished_ms is None else _iso(max(row.started_ms or row.created_ms, row.finished_ms)),
-        reason=outcome.reason,
-        error=outcome.error,
         progress=replace(outcome.progress, waits_for=waits),
-        artifacts=outcome.artifacts,
-        metrics=outcome.metrics,
         worker=row.worker if row.attempt else None,
-        retry_of=row.retry_of,
-        attempts=outcome.attempts,
-        owner=row.owner,
-        private=row.private,
     )
 
 

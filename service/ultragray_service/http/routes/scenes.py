@@ -7,7 +7,7 @@ import base64
 import json
 import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, BinaryIO
 
@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from ultragray.contract import described
+from ultragray.contract import described, made_of
 from ultragray.errors import InvalidArgument
 from ultragray.files import file_sha256
 from ultragray.learn.localization.settings import LocalizationSettings
@@ -110,9 +110,8 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     """Where in the scene a real frame was taken, looked for about `start`."""
     body = await read_json_body(request, LocalizeBody, LARGE_IMAGE)
     deadline = service.planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
-    known = {item.name: getattr(body, item.name) for item in fields(LocalizationSettings)}
     image = await asyncio.to_thread(_bytes_of, body.image)
-    sought = sought_frame(image, body.image_height, body.image_width, LocalizationSettings(**known))
+    sought = sought_frame(image, body.image_height, body.image_width, made_of(LocalizationSettings, body))
     start = None if body.start is None else body.start.exact("start")
     work = locate(service.rendering, scene, sought, start, deadline, body.registration)
     return await finish_or_abandon(work, request.receive, deadline)
@@ -134,7 +133,7 @@ async def plan_views(request: Request, service: ServiceDep, scene: SceneName) ->
     work = next_views(
         service.rendering,
         scene,
-        PlanSettings(**{item.name: getattr(body, item.name) for item in fields(PlanSettings)}),
+        made_of(PlanSettings, body),
         deadline,
         poses=poses,
         view=None if body.view is None else body.view.exact("view"),

@@ -19,6 +19,7 @@ from typing import NoReturn, TypeVar
 from opentelemetry import propagate, trace
 from opentelemetry.trace import Status, StatusCode
 
+from ultragray.contract import made_of
 from ultragray.errors import MemoryExceeded
 from ultragray_workers.claims import is_no_room
 from ultragray_workers.errors import (
@@ -242,18 +243,15 @@ class _JobAtHand:
         """Runs processes until one has said how the job ended, or so many have died that it failed."""
         config, folder, row = self._config, self._folder, self._row
         folder.write_request(
-            Request(
+            made_of(
+                Request,
+                row,
+                config,
                 specification=self._ask(lambda: queue.specification_of(self._engine, row.id)),
                 submitted=row.number,
-                batch=row.batch,
-                retry_of=row.retry_of,
                 device=self._device.device.name,
-                threads=config.threads,
-                nice=config.nice,
                 artifact_folder=str(config.artifact_folder),
                 storage=config.storage.location,
-                max_footprint_pixels=config.max_footprint_pixels,
-                max_copies_bytes=config.max_copies_bytes,
                 longest_share_s=LONGEST_SHARE_S,
             )
         )
