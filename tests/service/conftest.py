@@ -18,6 +18,7 @@ import torch
 from websockets.sync.client import connect
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo
+from ultragray_client import Client
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
 from ..waiting import Deadline, wait_until
@@ -41,6 +42,7 @@ class RunningService:
     def __init__(self, data_folder, log_path, environment, *, cold=False):
         """`cold` starts `python -m ultragray_service`; else it is forked from a process with the imports done."""
         self.data_folder = data_folder
+        self.key = environment.get("ULTRAGRAY_API_KEYS", "").partition(",")[0] or None
         self._run = f"{os.environ['PYTEST_RUN']}-{next(_numbers)}"
         self.log_path = log_path
         settings = {
@@ -241,24 +243,34 @@ def service(start_shared_service):
     )
 
 
-@pytest.fixture(scope="session")
+# Those who ask the service of a module: the one that most tests share, or its own of the name.
+
+
+@pytest.fixture(scope="module")
 def http(service):
-    with httpx.Client(base_url=service.http, timeout=300) as client:
+    headers = {} if service.key is None else {"X-API-Key": service.key}
+    with httpx.Client(base_url=service.http, headers=headers, timeout=300) as client:
         yield client
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
+def client(service):
+    with Client(service.grpc, api_key=service.key, timeout_s=300.0) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
 def channel(service):
     with service.channel() as channel:
         yield channel
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def renders(channel):
     return rendering_pb2_grpc.RenderServiceStub(channel)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def scenes(channel):
     return scenes_pb2_grpc.SceneServiceStub(channel)
 

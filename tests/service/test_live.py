@@ -7,7 +7,6 @@ import os
 import signal
 import threading
 
-import httpx
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosedError
@@ -54,18 +53,6 @@ def message_of(number, image=None, pose=None):
 @pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts)
-
-
-@pytest.fixture(scope="module")
-def http(service):
-    with httpx.Client(base_url=service.http, timeout=300) as http:
-        yield http
-
-
-@pytest.fixture(scope="module")
-def client(service):
-    with Client(service.grpc) as client:
-        yield client
 
 
 @pytest.fixture

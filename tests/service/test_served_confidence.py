@@ -5,7 +5,6 @@ import shutil
 from dataclasses import replace
 
 import grpc
-import httpx
 import numpy as np
 import pytest
 
@@ -37,7 +36,7 @@ def knowing(demo_scene):
 
 
 @pytest.fixture(scope="module")
-def knowing_service(start_service, knowing, data_folder, tmp_path_factory):
+def service(start_service, knowing, data_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("knowing")
     knowing.save(folder / "knowing.ugr")
     coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",))["coverage"]
@@ -48,14 +47,8 @@ def knowing_service(start_service, knowing, data_folder, tmp_path_factory):
     return start_service(data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"))
 
 
-@pytest.fixture(scope="module")
-def client(knowing_service):
-    with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/", timeout=300) as client:
-        yield client
-
-
-def test_a_frame_tells_what_the_library_says(client, knowing):
-    answer = client.post("knowing/render", json=body(NEAR))
+def test_a_frame_tells_what_the_library_says(http, knowing):
+    answer = http.post("/v1/scenes/knowing/render", json=body(NEAR))
     told = json.loads(answer.headers["X-Ultragray-Extrapolation"])
     coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",)).coverage
     (expected,) = Assessor(knowing.info, knowing.training_poses).assess(at(NEAR), coverage=coverage.numpy())
@@ -64,49 +57,51 @@ def test_a_frame_tells_what_the_library_says(client, knowing):
     assert float(answer.headers["X-Ultragray-Confidence"]) == pytest.approx(told["confidence"], abs=6e-4)
 
 
-def test_a_scene_that_cannot_tell_says_so(client):
-    answer = client.post("demo/render", json=body(NEAR))
+def test_a_scene_that_cannot_tell_says_so(http):
+    answer = http.post("/v1/scenes/demo/render", json=body(NEAR))
     told = json.loads(answer.headers["X-Ultragray-Extrapolation"])
     assert told["confidence"] is None
     assert told["distance_mm"] == pytest.approx(0.0, abs=1e-6)
     assert answer.headers["X-Ultragray-Confidence"] == ""
-    refusal = client.post("demo/render", json=body(NEAR, min_confidence=0.5)).json()
+    refusal = http.post("/v1/scenes/demo/render", json=body(NEAR, min_confidence=0.5)).json()
     assert (refusal["reason"], refusal["field"]) == ("INVALID_ARGUMENT", "min_confidence")
 
 
-def test_poses_below_the_limit_are_refused(client):
-    assert client.post("knowing/render", json=body(NEAR, min_confidence=0.5)).status_code == 200
-    answer = client.post("knowing/render", json=body(FAR, min_confidence=0.5))
+def test_poses_below_the_limit_are_refused(http):
+    assert http.post("/v1/scenes/knowing/render", json=body(NEAR, min_confidence=0.5)).status_code == 200
+    answer = http.post("/v1/scenes/knowing/render", json=body(FAR, min_confidence=0.5))
     assert answer.status_code == 422
     assert answer.json()["reason"] == "LOW_CONFIDENCE"
     assert "16.0 mm" in answer.json()["detail"]
-    many = client.post("knowing/render", json=body(NEAR, NEAR, FAR, min_confidence=0.5)).json()
+    many = http.post("/v1/scenes/knowing/render", json=body(NEAR, NEAR, FAR, min_confidence=0.5)).json()
     assert (many["reason"], many["field"]) == ("LOW_CONFIDENCE", "poses[2]")
-    assert client.post("knowing/render", json=body(FAR, min_confidence=1.5)).json()["field"] == "min_confidence"
+    assert (
+        http.post("/v1/scenes/knowing/render", json=body(FAR, min_confidence=1.5)).json()["field"] == "min_confidence"
+    )
 
 
-def test_so_are_frames_that_turn_out_below_it(client):
+def test_so_are_frames_that_turn_out_below_it(http):
     """The pose alone suffices; the Gaussians support too little of its frame."""
-    told = client.post("thin/render", json=body(NEAR, min_confidence=0.3))
+    told = http.post("/v1/scenes/thin/render", json=body(NEAR, min_confidence=0.3))
     confidence = float(told.headers["X-Ultragray-Confidence"])
     assert 0.3 < confidence < 0.5
-    answer = client.post("thin/render", json=body(NEAR, NEAR, min_confidence=0.5))
+    answer = http.post("/v1/scenes/thin/render", json=body(NEAR, NEAR, min_confidence=0.5))
     assert (answer.status_code, answer.json()["reason"], answer.json()["field"]) == (422, "LOW_CONFIDENCE", "poses[0]")
     assert "Gaussians support" in answer.json()["detail"]
     fields = {"outputs": ["bmode", "coverage"], "dtype": "float32", "min_confidence": 0.5}
-    masked = client.post("thin/render", json=body(NEAR, below_min_confidence="mask", **fields))
+    masked = http.post("/v1/scenes/thin/render", json=body(NEAR, below_min_confidence="mask", **fields))
     bmode, coverage = np.frombuffer(masked.content, "<f4").reshape(2, HEIGHT, WIDTH)
     assert 0.0 < (coverage < 0.3).mean() < 1.0
     assert (bmode[coverage < 0.3] == 0).all()
 
 
-def test_grpc(knowing_service):
+def test_grpc(service):
     settings = rendering_pb2.RenderSettings(scene="knowing", min_confidence=0.5)
 
     def pose(y):
         return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=at(y).ravel().tolist()))
 
-    with knowing_service.channel() as channel:
+    with service.channel() as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose(NEAR)))
         assert 0.5 < frame.extrapolation.confidence <= 1

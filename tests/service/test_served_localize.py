@@ -28,14 +28,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def phantom(start_service, folder, artifacts):
+def service(start_service, folder, artifacts):
     return start_service(data_folder=folder, artifact_folder=artifacts)
-
-
-@pytest.fixture(scope="module")
-def http(phantom):
-    with httpx.Client(base_url=phantom.http, timeout=300.0) as client:
-        yield client
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +66,8 @@ def test_a_png_file_is_found_over_http(http, png):
     assert found["search_ms"] > 0.0
 
 
-def test_arrays_and_files_are_found_by_the_client(phantom, pixels, png):
-    with Client(phantom.grpc, timeout_s=300.0) as client:
+def test_arrays_and_files_are_found_by_the_client(service, pixels, png):
+    with Client(service.grpc, timeout_s=300.0) as client:
         of_array = client.localize("spine", pixels / np.float32(255.0), start())
         of_file = client.localize("spine", png, start())
     assert of_array.is_found
@@ -82,7 +76,7 @@ def test_arrays_and_files_are_found_by_the_client(phantom, pixels, png):
     assert len(of_array.position_std_mm) == 3
 
 
-def test_start_and_answer_are_in_the_frame_of_a_registration(phantom, http, pixels, png):
+def test_start_and_answer_are_in_the_frame_of_a_registration(service, http, pixels, png):
     base_to_scene, mounting = np.eye(4), np.eye(4)
     base_to_scene[:3] = ((0, -1, 0, 400), (1, 0, 0, -30), (0, 0, 1, 5))
     mounting[:3, 3] = (0, 0, 142)
@@ -90,7 +84,7 @@ def test_start_and_answer_are_in_the_frame_of_a_registration(phantom, http, pixe
     def in_base(pose):
         return np.linalg.inv(base_to_scene) @ pose @ np.linalg.inv(mounting)
 
-    with Client(phantom.grpc, timeout_s=300.0) as client:
+    with Client(service.grpc, timeout_s=300.0) as client:
         client.registrations.put("robot", "spine", base_to_scene, mounting)
         found = client.localize("spine", pixels, in_base(start()), registration="robot")
         plain = client.localize("spine", pixels, start())
@@ -105,13 +99,13 @@ def test_start_and_answer_are_in_the_frame_of_a_registration(phantom, http, pixe
     assert (refused.status_code, refused.json()["field"]) == (404, "registration")
 
 
-def test_a_frame_is_tracked_and_found_from_nowhere_at_both_doors(phantom, http, pixels, png):
+def test_a_frame_is_tracked_and_found_from_nowhere_at_both_doors(service, http, pixels, png):
     tracked = http.post("/v1/scenes/spine:localize", json=body(png, search="track")).json()
     np.testing.assert_allclose(tracked["pose"], POSE, atol=0.2)
     asked = {key: value for key, value in body(png, search="anywhere").items() if key != "start"}
     told = http.post("/v1/scenes/spine:localize", json=asked).json()
     np.testing.assert_allclose(told["pose"], POSE, atol=0.2)
-    with Client(phantom.grpc, timeout_s=300.0) as client:
+    with Client(service.grpc, timeout_s=300.0) as client:
         found = client.localize("spine", pixels, search="anywhere")
         on = client.localize("spine", pixels, start(), search="track")
         with pytest.raises(InvalidArgument, match="start is required, unless search is anywhere"):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import shutil
 
-import httpx
 import numpy as np
 import pytest
 
 import ultragray
 from ultragray import plan_views
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
-from ultragray_client import Client, PlanSettings
+from ultragray_client import PlanSettings
 from ultragray_client.errors import InvalidArgument, InvalidPose, SceneNotFound, TooManyPoses
 
 PATH = "/v1/scenes/spine:plan"
@@ -19,22 +18,10 @@ ASKED = {"views": 4, "within_mm": 0.5, "tilt_deg": 20.0}
 
 
 @pytest.fixture(scope="module")
-def served(start_service, tmp_path_factory, artifacts):
+def service(start_service, tmp_path_factory, artifacts):
     folder = tmp_path_factory.mktemp("planned")
     shutil.copy(DEMO_FILE, folder / "spine.ugr")
     return start_service(data_folder=folder, artifact_folder=artifacts)
-
-
-@pytest.fixture(scope="module")
-def http(served):
-    with httpx.Client(base_url=served.http, timeout=300.0) as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def client(served):
-    with Client(served.grpc, timeout_s=300.0) as opened:
-        yield opened
 
 
 def test_every_door_has_the_plan_of_the_library(http, client):

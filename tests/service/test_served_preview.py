@@ -20,15 +20,15 @@ SETTINGS = RenderSettings(height=SIDE, width=SIDE)
 
 
 @pytest.fixture(scope="module")
-def phantom(start_service, tmp_path_factory, artifacts):
+def service(start_service, tmp_path_factory, artifacts):
     folder = tmp_path_factory.mktemp("phantom")
     shutil.copy(DEMO_FILE, folder / "spine.ugr")
     return start_service(data_folder=folder, artifact_folder=artifacts)
 
 
 @pytest.fixture
-def stream(phantom):
-    with Client(phantom.grpc) as client, client.stream("spine", SETTINGS, mode="latest") as stream:
+def stream(service):
+    with Client(service.grpc) as client, client.stream("spine", SETTINGS, mode="latest") as stream:
         yield stream
 
 
@@ -81,10 +81,10 @@ def test_a_real_frame_that_is_none_is_refused_and_the_stream_goes_on(stream):
     assert stream.receive().preview is None
 
 
-def test_real_frames_are_sent_beside_asynchronous_poses(phantom):
+def test_real_frames_are_sent_beside_asynchronous_poses(service):
     async def first_preview():
         image, deadline = real((0.0, 0.0, 0.0)), Deadline(120)
-        async with AsyncClient(phantom.grpc) as client, client.stream("spine", SETTINGS, mode="latest") as stream:
+        async with AsyncClient(service.grpc) as client, client.stream("spine", SETTINGS, mode="latest") as stream:
             while not deadline.passed:
                 now_ns = time.monotonic_ns()
                 await stream.send(POSE, measured_ns=now_ns)

@@ -1,9 +1,8 @@
-"""Registrations are kept by name, and clients send poses in their own frame."""
+"""Registrations are service by name, and clients send poses in their own frame."""
 
 from json import dumps, loads
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 from websockets.sync.client import connect
@@ -34,20 +33,8 @@ FLANGE = np.linalg.inv(BASE_TO_SCENE) @ POSE @ np.linalg.inv(MOUNTING)
 
 
 @pytest.fixture(scope="module")
-def kept(start_service, artifacts):
+def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts)
-
-
-@pytest.fixture(scope="module")
-def client(kept):
-    with Client(kept.grpc, timeout_s=300.0) as one:
-        yield one
-
-
-@pytest.fixture(scope="module")
-def http(kept):
-    with httpx.Client(base_url=kept.http, timeout=300.0) as one:
-        yield one
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -89,7 +76,7 @@ def test_batches_streams_and_assessments_are_led_as_well(client):
     assert led.distance_mm == pytest.approx(plain.distance_mm)
 
 
-def test_http_and_websocket_take_it_too(kept, http):
+def test_http_and_websocket_take_it_too(service, http):
     asked = {"pose": {"matrix": FLANGE.tolist()}, "registration": "robot", **SIZE}
     answer = http.post("/v1/scenes/demo/render", json=asked)
     assert answer.status_code == 200, answer.text
@@ -98,7 +85,7 @@ def test_http_and_websocket_take_it_too(kept, http):
     poses = {"poses": [{"matrix": FLANGE.tolist()}], "registration": "robot"}
     assert http.post("/v1/scenes/demo:assess", json=poses).status_code == 200
     message = {"settings": {**SIZE, "registration": "robot"}, "pose": {"matrix": FLANGE.tolist()}}
-    with connect(kept.stream_url()) as socket:
+    with connect(service.stream_url()) as socket:
         socket.send(dumps(message))
         answered = socket.recv(timeout=300)
     np.testing.assert_allclose(split(answered)[0]["pose"], POSE, atol=1e-9)

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import grpc
-import httpx
 import numpy as np
 import pytest
 import torch
@@ -35,7 +34,7 @@ from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle
 from ultragray.scene.modes import Mode, Motion, Moving
 from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
 from ultragray_proto.codec import to_message
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2, scenes_pb2_grpc
 from ultragray_service.igtl.contents import unpack_image
 
 from .conftest import DEMO_PROBE, make_scene, split
@@ -111,25 +110,13 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def served(start_service, scene, tmp_path_factory):
+def service(start_service, scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("settings")
     scene.save(folder / "rich.ugr")
     replace(make_scene(20, probe=DEMO_PROBE), training_poses=np.zeros((0, 4, 4))).save(folder / "poor.ugr")
     return start_service(
         data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"), igtl_port=0, igtl_slice_thickness_mm=6
     )
-
-
-@pytest.fixture(scope="module")
-def http(served):
-    with httpx.Client(base_url=f"{served.http}/v1/", timeout=300) as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def renders(served):
-    with served.channel() as channel:
-        yield rendering_pb2_grpc.RenderServiceStub(channel)
 
 
 def expected(scene, name):  # [outputs, H, W]
@@ -187,7 +174,7 @@ def test_the_settings_make_a_difference(scene):
 @EACH
 def test_http_has_the_pixels_of_the_library_and_tells_how_to_render_them_again(http, scene, name):
     asked, _ = CASES[name]
-    answer = http.post("scenes/rich/render", json=body(asked), headers=RAW)
+    answer = http.post("/v1/scenes/rich/render", json=body(asked), headers=RAW)
     assert answer.status_code == 200, answer.text
     truth = expected(scene, name)
     assert answer.headers["X-Ultragray-Shape"] == f"{len(truth)},1,{truth.shape[1]},{truth.shape[2]}"
@@ -195,7 +182,7 @@ def test_http_has_the_pixels_of_the_library_and_tells_how_to_render_them_again(h
     facts = told(answer.headers)
     assert {key: facts[key] for key in asked if key in facts} == {key: asked[key] for key in asked if key in facts}
     again = http.post(
-        "scenes/rich/render",
+        "/v1/scenes/rich/render",
         json=body({}, **facts, **({"display": asked["display"]} if "display" in asked else {})),
         headers=RAW,
     )
@@ -204,7 +191,7 @@ def test_http_has_the_pixels_of_the_library_and_tells_how_to_render_them_again(h
 
 
 @EACH
-def test_the_other_doors_give_the_same(served, renders, scene, name):
+def test_the_other_doors_give_the_same(service, renders, scene, name):
     asked, _ = CASES[name]
     truth = expected(scene, name)
     frame = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message()), timeout=300)
@@ -213,7 +200,7 @@ def test_the_other_doors_give_the_same(served, renders, scene, name):
     for field in ("probe", "contact", "tools", "ghost", "phase", "speckle", "display"):
         if field in asked:
             assert getattr(frame, field) == getattr(wanted, field)
-    with connect(served.stream_url("rich"), compression=None) as stream:
+    with connect(service.stream_url("rich"), compression=None) as stream:
         settings = {"height": HEIGHT, "width": WIDTH, "encoding": "float32", **asked}
         stream.send(json.dumps({"settings": settings, "pose": POSE_BODY}))
         answer = stream.recv(timeout=300)
@@ -223,8 +210,8 @@ def test_the_other_doors_give_the_same(served, renders, scene, name):
     assert (header["rendered_height"], header["rendered_width"]) == (HEIGHT, WIDTH)
 
 
-def test_openigtlink_has_the_thickness_of_its_setting(served, scene):
-    peer = Peer(address_of(served))
+def test_openigtlink_has_the_thickness_of_its_setting(service, scene):
+    peer = Peer(address_of(service))
     peer.send_pose(POSE, "rich", version=2)
     message = peer.receive()
     peer.socket.close()
@@ -241,7 +228,7 @@ def test_archives_hold_every_pose(http, scene, count):
     asked = body({"tools": to_dict(TOOLS), "contact": "air", "outputs": ["bmode", "labels"]})
     del asked["pose"]
     poses = [{"matrix": np.eye(4).tolist()}] * (count - 1) + [POSE_BODY]
-    answer = http.post("scenes/rich/render", json={**asked, "poses": poses}, headers=NPZ)
+    answer = http.post("/v1/scenes/rich/render", json={**asked, "poses": poses}, headers=NPZ)
     frames = render(
         scene,
         None,
@@ -266,7 +253,7 @@ def test_frames_asked_for_at_once_keep_their_own_tools(http, scene):
     needles = [Needle(tip_mm=(5.0, 2.0, 10.0 + place), hub_mm=(-15.0, 2.0, 5.0)) for place in range(12)]
 
     def ask(needle):
-        return http.post("scenes/rich/render", json=body({"tools": to_dict((needle,))}), headers=RAW).content
+        return http.post("/v1/scenes/rich/render", json=body({"tools": to_dict((needle,))}), headers=RAW).content
 
     with ThreadPoolExecutor(len(needles)) as threads:
         found = list(threads.map(ask, needles))
@@ -285,23 +272,23 @@ REFUSALS = [
 
 @pytest.mark.parametrize(("asked", "field", "words"), REFUSALS, ids=[field for _, field, _ in REFUSALS])
 def test_what_cannot_be_rendered_is_refused(http, asked, field, words):
-    answer = http.post("scenes/rich/render", json=body(asked))
+    answer = http.post("/v1/scenes/rich/render", json=body(asked))
     assert (answer.status_code, answer.json()["field"]) == (422, field), answer.text
     assert words in answer.json()["detail"]
     if "display" not in asked:  # which is the viewer's, not the frame's
         specification = {"scene": "rich", "poses": [POSE.tolist()], **asked}
-        refused = http.post("jobs", json={"kind": "render", "specification": specification}).json()
+        refused = http.post("/v1/jobs", json={"kind": "render", "specification": specification}).json()
         assert refused["field"] == f"specification.{field}"
 
 
-def test_the_other_doors_refuse_by_name(served, renders):
+def test_the_other_doors_refuse_by_name(service, renders):
     same = geometry_pb2.Tool(
         needle=geometry_pb2.Needle(**dict.fromkeys(("tip_mm", "hub_mm"), geometry_pb2.Position(z=1.0)))
     )
     settings = rendering_pb2.RenderSettings(scene="rich", tools=[same])
     with pytest.raises(grpc.RpcError, match=r"tools\[0\].*hub_mm must differ"):
         renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose_message()))
-    with connect(served.stream_url("rich")) as stream:
+    with connect(service.stream_url("rich")) as stream:
         stream.send(json.dumps({"settings": {"display": {"flip": 1}}}))
         assert json.loads(stream.recv(timeout=300))["error"]["field"] == "settings.display.flip"
 
@@ -312,30 +299,30 @@ def test_a_scene_without_what_a_setting_needs_refuses_it(http):
         ({"speckle": "natural"}, "speckle", "fitted the speckle of its frames"),
         ({"outputs": ["labels"]}, "outputs", "carry labels"),
     ):
-        answer = http.post("scenes/poor/render", json=body(asked, dtype=None))
+        answer = http.post("/v1/scenes/poor/render", json=body(asked, dtype=None))
         assert (answer.status_code, answer.json()["field"]) == (422, field), answer.text
         assert words in answer.json()["detail"]
     specification = {"scene": "poor", "poses": [POSE.tolist()], "contact": "air"}
-    refused = http.post("jobs", json={"kind": "render", "specification": specification}).json()
+    refused = http.post("/v1/jobs", json={"kind": "render", "specification": specification}).json()
     assert refused["field"] == "specification.contact"
 
 
 def test_labels_are_numbers_in_every_form(http, scene):
     truth = expected(scene, "labels")[0].astype(np.uint8)
     asked = {key: value for key, value in body(CASES["labels"][0], outputs=["labels"]).items() if key != "dtype"}
-    raw = http.post("scenes/rich/render", json=asked, headers=RAW)
+    raw = http.post("/v1/scenes/rich/render", json=asked, headers=RAW)
     np.testing.assert_array_equal(np.frombuffer(raw.content, np.uint8).reshape(truth.shape), truth)
-    picture = http.post("scenes/rich/render", json=asked, headers={"Accept": "image/jpeg, image/*;q=0.5"})
+    picture = http.post("/v1/scenes/rich/render", json=asked, headers={"Accept": "image/jpeg, image/*;q=0.5"})
     assert picture.headers["Content-Type"] == "image/png"  # jpeg would change them
-    assert http.post("scenes/rich/render", json=asked, headers={"Accept": "image/jpeg"}).status_code == 406
+    assert http.post("/v1/scenes/rich/render", json=asked, headers={"Accept": "image/jpeg"}).status_code == 406
 
 
-def test_a_scene_tells_what_it_has(http, served):
-    rich, poor = http.get("scenes/rich").json(), http.get("scenes/poor").json()
+def test_a_scene_tells_what_it_has(http, service):
+    rich, poor = http.get("/v1/scenes/rich").json(), http.get("/v1/scenes/poor").json()
     assert (rich["beam"], poor["beam"]) == (to_dict(BEAM), None)
     assert (rich["speckle"], poor["speckle"]) == (True, False)
     assert (rich["label_names"], poor["label_names"]) == ({"1": "bone", "200": "vessel"}, {})
-    with served.channel() as channel:
+    with service.channel() as channel:
         stub = scenes_pb2_grpc.SceneServiceStub(channel)
         message = stub.GetScene(scenes_pb2.GetSceneRequest(scene="rich"), timeout=300)
     assert (dict(message.label_names), message.beam.thickness_mm) == (NAMES, 3.0)
@@ -343,18 +330,18 @@ def test_a_scene_tells_what_it_has(http, served):
 
 def test_a_frame_of_a_scene_that_breathes_is_rendered_again_from_the_phase_that_it_tells(http, scene):
     asked = {"breathing": {"period_s": 3.0, "depth": 0.5}}
-    answer = http.post("scenes/rich/render", json=body(asked), headers=RAW)
+    answer = http.post("/v1/scenes/rich/render", json=body(asked), headers=RAW)
     assert answer.status_code == 200, answer.text
     (number,) = json.loads(answer.headers["X-Ultragray-Phase"])
     assert 0.0 <= number <= 0.5
-    again = http.post("scenes/rich/render", json=body({"phase": [number]}), headers=RAW)
+    again = http.post("/v1/scenes/rich/render", json=body({"phase": [number]}), headers=RAW)
     assert again.content == answer.content
     truth = render(scene.at_phase((number,)), None, POSE, height=HEIGHT, width=WIDTH, beam=BEAM).bmode[0]
     np.testing.assert_allclose(np.frombuffer(answer.content, "<f4").reshape(truth.shape), truth, atol=1e-5)
-    mode = http.get("scenes/rich").json()["motion"]["modes"][0]
+    mode = http.get("/v1/scenes/rich").json()["motion"]["modes"][0]
     assert (mode["name"], mode["low"], mode["high"]) == ("breathing", 0.0, 1.0)
 
 
 def test_motion_of_a_still_scene_is_refused(http):
-    answer = http.post("scenes/poor/render", json=body({"phase": [0.5]}), headers=RAW)
+    answer = http.post("/v1/scenes/poor/render", json=body({"phase": [0.5]}), headers=RAW)
     assert (answer.status_code, answer.json()["field"]) == (422, "phase"), answer.text

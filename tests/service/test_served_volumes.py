@@ -4,7 +4,6 @@ import io
 import json
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 import SimpleITK
@@ -13,7 +12,7 @@ import torch
 from ultragray import GaussianScene, SceneInfo
 from ultragray.rendering.volume_fields import sample_slice, sample_volume
 from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
-from ultragray_client import Client, SliceSettings, VoxelizeJob
+from ultragray_client import SliceSettings, VoxelizeJob
 from ultragray_client.errors import InvalidArgument, SceneNotFound
 
 from .conftest import DEMO_PROBE, make_scene
@@ -33,25 +32,13 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def volume_service(start_service, tmp_path_factory, scene):
+def service(start_service, tmp_path_factory, scene):
     folder = tmp_path_factory.mktemp("volumes")
     scene.save(folder / "labelled.ugr")
     make_scene(20, probe=DEMO_PROBE).save(folder / "plain.ugr")
     limits = {"max_image_side": 600, "max_request_pixels": 200_000, "max_footprint_pixels": 16_000_000}
     artifacts = tmp_path_factory.mktemp("artifacts")
     return start_service(data_folder=folder, artifact_folder=artifacts, embedded_worker=True, **limits)
-
-
-@pytest.fixture(scope="module")
-def http(volume_service):
-    with httpx.Client(base_url=volume_service.http, timeout=300) as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def client(volume_service):
-    with Client(volume_service.grpc, timeout_s=300) as client:
-        yield client
 
 
 def expected(scene, field):
@@ -121,14 +108,14 @@ def test_a_slice_that_cannot_be_is_refused(http, changes, status, field, text):
     assert text in problem.json()["detail"]
 
 
-def test_a_slice_that_costs_too_much_at_once_comes_in_pieces_of_rows(http, scene, volume_service):
-    before = volume_service.metric("ultragray_frames_total")
+def test_a_slice_that_costs_too_much_at_once_comes_in_pieces_of_rows(http, scene, service):
+    before = service.metric("ultragray_frames_total")
     answer = ask(http, RAW, origin_mm=[-22, 0, 0], right=[1, 0, 0], size_mm=[44, 40], spacing_mm=0.1)
     assert answer.status_code == 200, answer.text
     plane = VolumeGrid.on_plane((-22, 0, 0), (1, 0, 0), (0, 0, 1), (44, 40), 0.1)
     pixels = np.frombuffer(answer.content, np.float32).reshape(400, 440)
     np.testing.assert_allclose(pixels, sample_slice(scene, "echo", plane), atol=1e-5)
-    assert volume_service.metric("ultragray_frames_total") > before + 2
+    assert service.metric("ultragray_frames_total") > before + 2
 
 
 def test_other_types_of_answers_are_not_acceptable(http):
@@ -145,10 +132,10 @@ def test_refusals_over_grpc_name_the_field(client):
     assert caught.value.field == "slice.down"
 
 
-def test_a_slice_counts_as_a_frame(http, volume_service):
-    before = volume_service.metric("ultragray_frames_total")
+def test_a_slice_counts_as_a_frame(http, service):
+    before = service.metric("ultragray_frames_total")
     assert ask(http).status_code == 200
-    assert volume_service.metric("ultragray_frames_total") == before + 1
+    assert service.metric("ultragray_frames_total") == before + 1
 
 
 # Jobs

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tarfile
 
-import httpx
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -26,97 +25,91 @@ WAIT_S = 300.0
 KEY = "0123456789abcdef-jobs"
 
 
-def run(server, *arguments, key=KEY):
-    environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
+def run(service, *arguments, key=KEY):
+    environment = {"ULTRAGRAY_ADDRESS": service.http, "ULTRAGRAY_API_KEY": key}
     return CliRunner().invoke(app, ["jobs", *map(str, arguments)], env=environment)
 
 
-def done(server, *arguments):
-    result = run(server, *arguments)
+def done(service, *arguments):
+    result = run(service, *arguments)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
 @pytest.fixture(scope="module")
-def server(start_service, artifacts):
+def service(start_service, artifacts):
     """A service with a worker, which holds the dataset `tiny`."""
     store_dataset(artifacts, "tiny")
     return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, api_keys=KEY)
 
 
-@pytest.fixture(scope="module")
-def client(server):
-    with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
-        yield client
-
-
-def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server):
+def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(service):
     asked = ("--min-memory-gb", "900000", "--require", "site=lab1", "--require", "rack=4")
-    result = run(server, "submit", "render", "demo", "--sampler", "training", *asked)
+    result = run(service, "submit", "render", "demo", "--sampler", "training", *asked)
     assert result.exit_code == 0, result.output
     job = result.stdout.strip()
-    told = json.loads(done(server, "show", job, "--json"))
+    told = json.loads(done(service, "show", job, "--json"))
     assert told["specification"]["worker_labels"] == {"site": "lab1", "rack": "4"}
     wanted = "a worker with a device of at least 900000 GB and the labels rack=4, site=lab1"
     assert " ".join(result.stderr.split()).startswith(f"warning: {job} waits for {wanted}")
     assert told["progress"]["waits_for"].startswith(wanted)
-    done(server, "cancel", job)
+    done(service, "cancel", job)
 
 
-def test_poses_of_a_file_become_an_archive(server, client, tmp_path):
+def test_poses_of_a_file_become_an_archive(service, http, tmp_path):
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 1, 3] = (0.5, 1.5, 2.5)
     np.save(tmp_path / "poses.npy", poses)
     arguments = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 16, "--format", "tar", "--wait")
-    job = done(server, "submit", "render", "demo", *arguments).splitlines()[0]
-    *examples, name = client.get(f"/v1/jobs/{job}").json()["artifacts"]
+    job = done(service, "submit", "render", "demo", *arguments).splitlines()[0]
+    *examples, name = http.get(f"/v1/jobs/{job}").json()["artifacts"]
     assert examples == [f"example_{place:05d}.png" for place in range(3)]
-    done(server, "download", job, name, "-o", tmp_path / name)
+    done(service, "download", job, name, "-o", tmp_path / name)
     with tarfile.open(tmp_path / name) as archive:
         pictures = [entry for entry in archive.getnames() if entry.endswith(".png")]
     assert pictures == [f"{number:06d}.bmode.png" for number in range(3)]
-    assert client.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] == "application/x-tar"
-    listed = json.loads(done(server, "list", "--kind", "render", "--json"))
+    assert http.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] == "application/x-tar"
+    listed = json.loads(done(service, "list", "--kind", "render", "--json"))
     assert job in {entry["id"] for entry in listed}
-    assert job in done(server, "list", "--state", "succeeded")
+    assert job in done(service, "list", "--state", "succeeded")
 
 
-def test_shards_are_downloaded_by_one_name_those_that_are_missing(server, client, tmp_path):
+def test_shards_are_downloaded_by_one_name_those_that_are_missing(service, http, tmp_path):
     sampler = ("--sampler", "around", "--count", 50, "--shard-frames", 20, "--height", 24, "--width", 16)
-    job = done(server, "submit", "render", "demo", *sampler, "--wait").splitlines()[0]
-    told = client.get(f"/v1/jobs/{job}").json()
+    job = done(service, "submit", "render", "demo", *sampler, "--wait").splitlines()[0]
+    told = http.get(f"/v1/jobs/{job}").json()
     files = "frames-{000000..000002}.tar"
     assert told["artifacts"] == ["manifest.json", files]
     assert (told["specification"]["format"], told["progress"]["frames_done"]) == ("tar", 50)
-    assert "wrote 3 files" in done(server, "download", job, files, "-o", tmp_path / "frames")
+    assert "wrote 3 files" in done(service, "download", job, files, "-o", tmp_path / "frames")
     (tmp_path / "frames" / "frames-000001.tar").unlink()
-    again = json.loads(done(server, "download", job, files, "-o", tmp_path / "frames", "--json"))
+    again = json.loads(done(service, "download", job, files, "-o", tmp_path / "frames", "--json"))
     assert (again["files"], again["there_before"]) == (1, 2)
-    for shard in client.get(f"/v1/jobs/{job}/artifacts/manifest.json").json()["shards"]:
+    for shard in http.get(f"/v1/jobs/{job}/artifacts/manifest.json").json()["shards"]:
         assert file_sha256(tmp_path / "frames" / shard["file"]) == shard["sha256"]
-    assert client.get(f"/v1/jobs/{job}/artifacts/frames-000003.tar").status_code == 404
-    assert client.get(f"/v1/jobs/{job}/artifacts/{files}").status_code == 404
+    assert http.get(f"/v1/jobs/{job}/artifacts/frames-000003.tar").status_code == 404
+    assert http.get(f"/v1/jobs/{job}/artifacts/{files}").status_code == 404
 
 
-def test_a_job_that_fails_says_why_by_its_exit_code(server, client):
-    result = run(server, "submit", "train", "tiny", "--scene", "never", "--set", "memory_gb=0.001", "--wait")
+def test_a_job_that_fails_says_why_by_its_exit_code(service, http):
+    result = run(service, "submit", "train", "tiny", "--scene", "never", "--set", "memory_gb=0.001", "--wait")
     assert result.exit_code == JOB_FAILED, result.output
     assert "memory_gb allows" in result.stderr.splitlines()[-1]
     assert result.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in result.output
 
 
-def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server, client):
-    job = done(server, "submit", "train", "tiny", "--scene", "long", "--set", "steps=1000000").strip()
-    used = client.delete("/v1/datasets/tiny")
+def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(service, http):
+    job = done(service, "submit", "train", "tiny", "--scene", "long", "--set", "steps=1000000").strip()
+    used = http.delete("/v1/datasets/tiny")
     assert (used.status_code, used.json()["reason"]) == (409, "DATASET_IN_USE")
-    assert done(server, "cancel", job) == f"{job} cancelled\n"
-    assert run(server, "watch", job).exit_code == JOB_CANCELLED
-    again = done(server, "retry", job).strip()
-    assert client.get(f"/v1/jobs/{again}").json()["retry_of"] == job
-    done(server, "cancel", again)
-    assert done(server, "delete", again) == f"{again} deleted\n"
-    assert "there is no job" in run(server, "delete", again).stderr
+    assert done(service, "cancel", job) == f"{job} cancelled\n"
+    assert run(service, "watch", job).exit_code == JOB_CANCELLED
+    again = done(service, "retry", job).strip()
+    assert http.get(f"/v1/jobs/{again}").json()["retry_of"] == job
+    done(service, "cancel", again)
+    assert done(service, "delete", again) == f"{again} deleted\n"
+    assert "there is no job" in run(service, "delete", again).stderr
 
 
 @pytest.mark.parametrize(
@@ -129,8 +122,8 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server, client
         (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
     ],
 )
-def test_mistakes_give_one_line(server, arguments, told):
-    result = run(server, *arguments)
+def test_mistakes_give_one_line(service, arguments, told):
+    result = run(service, *arguments)
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ")
     assert told in result.stderr
@@ -169,9 +162,9 @@ def test_many_metrics_stand_in_lines_of_their_own():
     assert lines == [f"  method_{number}_gms 0.5" for number in range(7)]
 
 
-def test_commands_list_pause_drain_and_resume(server):
+def test_commands_list_pause_drain_and_resume(service):
     def asked(*arguments):
-        environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": KEY}
+        environment = {"ULTRAGRAY_ADDRESS": service.http, "ULTRAGRAY_API_KEY": KEY}
         return CliRunner().invoke(app, ["workers", *arguments], env=environment)
 
     def told(*arguments):

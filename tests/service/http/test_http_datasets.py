@@ -107,12 +107,6 @@ def service(start_service, artifacts):
     )
 
 
-@pytest.fixture(scope="module")
-def http(service):
-    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=300) as client:
-        yield client
-
-
 @pytest.fixture
 def files(tmp_path):
     return released_files(tmp_path / "tiny")

@@ -24,19 +24,13 @@ WAIT_S = 300.0
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service, artifacts):
+def service(start_service, artifacts):
     """A service without a worker: what is submitted waits."""
     return start_service(artifact_folder=artifacts)
 
 
-@pytest.fixture(scope="module")
-def client(jobs_service):
-    with httpx.Client(base_url=jobs_service.http, timeout=300) as client:
-        yield client
-
-
-def submit(client, **changes):
-    answer = client.post("/v1/jobs", json=RENDER | changes)
+def submit(http, **changes):
+    answer = http.post("/v1/jobs", json=RENDER | changes)
     assert answer.status_code == 201, answer.text
     return answer.json()
 
@@ -47,9 +41,9 @@ def problem(answer):
     return answer.status_code, document["reason"], document["field"]
 
 
-def test_the_life_of_a_job_that_no_worker_takes(client):
+def test_the_life_of_a_job_that_no_worker_takes(http):
     body = RENDER | {"request_id": "mine/1", "priority": 3}
-    first, again = client.post("/v1/jobs", json=body), client.post("/v1/jobs", json=body)
+    first, again = http.post("/v1/jobs", json=body), http.post("/v1/jobs", json=body)
     assert (first.status_code, again.status_code, again.json()) == (201, 200, first.json())
     job = first.json()
     route = f"/v1/jobs/{job['id']}"
@@ -58,52 +52,52 @@ def test_the_life_of_a_job_that_no_worker_takes(client):
     assert job["started_at"] is job["finished_at"] is job["reason"] is None
     told = {name: value for name, value in job["progress"].items() if value is not None}
     assert told == {"waits_for": "a worker: none is running"}
-    assert client.get(route).json() == job
-    assert problem(client.post("/v1/jobs", json=body | {"priority": 1})) == (409, "REQUEST_ID_CONFLICT", "request_id")
-    log = client.get(f"{route}/log")
+    assert http.get(route).json() == job
+    assert problem(http.post("/v1/jobs", json=body | {"priority": 1})) == (409, "REQUEST_ID_CONFLICT", "request_id")
+    log = http.get(f"{route}/log")
     assert (log.status_code, log.text, log.headers["content-type"][:10]) == (200, "", "text/plain")
     for name, reason in (("..%2fjob.json", "ROUTE_NOT_FOUND"), ("metrics.json", "ARTIFACT_NOT_FOUND")):
-        assert problem(client.get(f"{route}/artifacts/{name}"))[:2] == (404, reason)
-    assert problem(client.post(f"{route}:retry")) == (409, "JOB_NOT_FINISHED", "job")
-    assert problem(client.delete(route)) == (409, "JOB_IN_USE", "job")
+        assert problem(http.get(f"{route}/artifacts/{name}"))[:2] == (404, reason)
+    assert problem(http.post(f"{route}:retry")) == (409, "JOB_NOT_FINISHED", "job")
+    assert problem(http.delete(route)) == (409, "JOB_IN_USE", "job")
     for _ in range(2):
-        cancelled = client.post(f"{route}:cancel")
+        cancelled = http.post(f"{route}:cancel")
         assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
-    retried = [client.post(f"{route}:retry") for _ in range(2)]
+    retried = [http.post(f"{route}:retry") for _ in range(2)]
     assert [(one.status_code, one.json()["retry_of"]) for one in retried] == [(201, job["id"]), (200, job["id"])]
     successor = f"/v1/jobs/{retried[0].json()['id']}"
     for gone in (successor, route):
-        client.post(f"{gone}:cancel")
-        assert client.delete(gone).status_code == 204
-        for answer in (client.get(gone), client.delete(gone)):
+        http.post(f"{gone}:cancel")
+        assert http.delete(gone).status_code == 204
+        for answer in (http.get(gone), http.delete(gone)):
             assert problem(answer) == (404, "JOB_NOT_FOUND", "job")
 
 
-def test_pages_join_to_the_whole_list(client):
-    made = [submit(client)["id"] for _ in range(3)]
+def test_pages_join_to_the_whole_list(http):
+    made = [submit(http)["id"] for _ in range(3)]
     found, token = [], ""
     while token or not found:
-        page = client.get("/v1/jobs", params={"page_size": 2, "page_token": token, "state": "queued"}).json()
+        page = http.get("/v1/jobs", params={"page_size": 2, "page_token": token, "state": "queued"}).json()
         found += [job["id"] for job in page["jobs"]]
         token = page["next_page_token"]
     assert (found[:3], len(set(found))) == (made[::-1], len(found))
-    assert client.get("/v1/jobs", params={"kind": "train"}).json() == {"jobs": [], "next_page_token": ""}
+    assert http.get("/v1/jobs", params={"kind": "train"}).json() == {"jobs": [], "next_page_token": ""}
     for name, value in (("page_token", "made-up"), ("state", "asleep")):
-        assert problem(client.get("/v1/jobs", params={name: value}))[1:] == ("INVALID_ARGUMENT", name)
+        assert problem(http.get("/v1/jobs", params={name: value}))[1:] == ("INVALID_ARGUMENT", name)
 
 
-def test_a_render_job_is_estimated_and_not_submitted(client):
-    before = client.get("/v1/jobs").json()["jobs"]
+def test_a_render_job_is_estimated_and_not_submitted(http):
+    before = http.get("/v1/jobs").json()["jobs"]
     sampler = {"kind": "around", "count": 300}
     asked = {"scene": "demo", "sampler": sampler, "height": 32, "width": 16, "outputs": ["bmode", "echo"]}
-    found = client.post("/v1/jobs:estimate", json={"kind": "render", "specification": asked | {"dtype": "float32"}})
+    found = http.post("/v1/jobs:estimate", json={"kind": "render", "specification": asked | {"dtype": "float32"}})
     assert found.status_code == 200, found.text
     told = found.json()
     assert (told["frames"], told["files"], told["height"], told["width"]) == (300, 1, 32, 16)
     assert told["bytes"] == 300 * 32 * 16 * (4 + 4)
     assert len(told["poses"]) == 256
     assert told["seconds"] > 0.0
-    assert client.get("/v1/jobs").json()["jobs"] == before
+    assert http.get("/v1/jobs").json()["jobs"] == before
 
 
 @pytest.mark.parametrize(
@@ -118,8 +112,8 @@ def test_a_render_job_is_estimated_and_not_submitted(client):
         ),
     ],
 )
-def test_what_cannot_be_estimated(client, kind, specification, expected):
-    assert problem(client.post("/v1/jobs:estimate", json={"kind": kind, "specification": specification})) == expected
+def test_what_cannot_be_estimated(http, kind, specification, expected):
+    assert problem(http.post("/v1/jobs:estimate", json={"kind": kind, "specification": specification})) == expected
 
 
 @pytest.mark.parametrize(
@@ -150,15 +144,15 @@ def test_what_cannot_be_estimated(client, kind, specification, expected):
         ),
     ],
 )
-def test_what_cannot_be_run_is_refused_by_name(client, body, status, reason, field):
-    assert problem(client.post("/v1/jobs", json=body)) == (status, reason, field)
+def test_what_cannot_be_run_is_refused_by_name(http, body, status, reason, field):
+    assert problem(http.post("/v1/jobs", json=body)) == (status, reason, field)
 
 
-def test_jobs_are_counted_for_prometheus(client, jobs_service):
-    before = len(client.get("/v1/jobs", params={"state": "queued", "page_size": 1000}).json()["jobs"])
-    submit(client)
-    wait_until(lambda: jobs_service.metric('ultragray_jobs{state="queued"}') == before + 1)
-    assert jobs_service.metric('ultragray_jobs{state="failed"}') == 0
+def test_jobs_are_counted_for_prometheus(http, service):
+    before = len(http.get("/v1/jobs", params={"state": "queued", "page_size": 1000}).json()["jobs"])
+    submit(http)
+    wait_until(lambda: service.metric('ultragray_jobs{state="queued"}') == before + 1)
+    assert service.metric('ultragray_jobs{state="failed"}') == 0
 
 
 def test_each_kind_has_a_documented_specification():
@@ -171,12 +165,12 @@ def test_each_kind_has_a_documented_specification():
 
 def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(start_service, tmp_path):
     service = start_service(artifact_folder=tmp_path, job_queue_limit=1)
-    with httpx.Client(base_url=service.http, timeout=WAIT_S) as client:
-        job = submit(client, request_id="kept")
-        full = client.post("/v1/jobs", json=RENDER)
+    with httpx.Client(base_url=service.http, timeout=WAIT_S) as http:
+        job = submit(http, request_id="kept")
+        full = http.post("/v1/jobs", json=RENDER)
         assert problem(full) == (429, "JOB_QUEUE_FULL", None)
         assert full.headers["retry-after"] == "10"
-        with client.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
+        with http.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
             told = read_events(answer.iter_lines())
             assert json.loads(next(told).data)["state"] == "queued"
             service.process.terminate()
@@ -224,8 +218,8 @@ class ToldLog:
 
 
 @pytest.fixture
-def job(client):
-    return str(submit(client)["id"])
+def job(http):
+    return str(submit(http)["id"])
 
 
 @pytest.fixture
@@ -233,11 +227,11 @@ def log(artifacts, job):
     return ToldLog(artifacts, job)
 
 
-def follow(client, job, last, wanted=None):
+def follow(http, job, last, wanted=None):
     """The events after `last`, until the job ends, or until `wanted` came and the connection is cut."""
     headers = {"Last-Event-ID": last} if last else {}
     told = []
-    with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as answer:
+    with http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as answer:
         assert answer.status_code == 200
         for event in read_events(answer.iter_lines()):
             told.append(event)
@@ -250,7 +244,7 @@ def log_of(events):
     return "".join(f"{event.data}\n" for event in events if event.name == "log")
 
 
-def test_a_client_that_comes_back_again_and_again_has_every_line_once(client, job, log):
+def test_a_client_that_comes_back_again_and_again_has_every_line_once(http, job, log):
 
     def write():
         for begin in range(0, 40_000, 2000):
@@ -258,34 +252,34 @@ def test_a_client_that_comes_back_again_and_again_has_every_line_once(client, jo
             stop.wait(0.1)
 
     stop = threading.Event()
-    told = follow(client, job, "", wanted=1)
+    told = follow(http, job, "", wanted=1)
     assert [event.name for event in told] == ["progress"]
     writing = threading.Thread(target=write)
     writing.start()
     try:
         while log_of(told).count("\n") < 40_000:
-            told += follow(client, job, told[-1].id, wanted=1)
+            told += follow(http, job, told[-1].id, wanted=1)
     finally:
         stop.set()
         writing.join(WAIT_S)
-    client.post(f"/v1/jobs/{job}:cancel")
-    told += follow(client, job, told[-1].id)
+    http.post(f"/v1/jobs/{job}:cancel")
+    told += follow(http, job, told[-1].id)
     assert log_of(told) == log.text
     states = [json.loads(event.data)["state"] for event in told if event.name == "progress"]
     assert states == ["queued", "cancelled"]
-    assert follow(client, job, told[-1].id) == []
+    assert follow(http, job, told[-1].id) == []
 
 
-def test_who_names_no_event_or_an_unknown_one_begins_with_the_job_and_the_last_lines(client, job, log):
+def test_who_names_no_event_or_an_unknown_one_begins_with_the_job_and_the_last_lines(http, job, log):
     log.write("".join(f"line {number}\n" for number in range(5000)))
     for last in ("", "7", "of another service", "9" * 40 + "-", "-1-"):
-        told = follow(client, job, last, wanted=2)
+        told = follow(http, job, last, wanted=2)
         assert [event.name for event in told] == ["log", "progress"]
         lines = log_of(told)
         assert log.text.endswith(lines)
         assert TAIL_BYTES - 20 < len(lines) <= TAIL_BYTES
 
 
-def test_lines_that_end_with_a_carriage_return_are_told_as_lines(client, job, log):
+def test_lines_that_end_with_a_carriage_return_are_told_as_lines(http, job, log):
     log.write("one\r\ntwo\r\n\r\nthree 1 %\rthree 2 %\r\n")
-    assert log_of(follow(client, job, "", wanted=1)) == "one\ntwo\n\nthree 1 %\nthree 2 %\n"
+    assert log_of(follow(http, job, "", wanted=1)) == "one\ntwo\n\nthree 1 %\nthree 2 %\n"

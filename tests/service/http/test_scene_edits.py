@@ -3,7 +3,6 @@
 import base64
 import json
 
-import httpx
 import pytest
 from typer.testing import CliRunner
 
@@ -37,12 +36,6 @@ RECIPE = {
 @pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts, api_keys=KEY)
-
-
-@pytest.fixture
-def http(service):
-    with httpx.Client(base_url=service.http, timeout=300, headers={"Authorization": f"Bearer {KEY}"}) as client:
-        yield client
 
 
 def test_an_edit_makes_a_scene_that_names_its_parent_and_what_was_put_in(http):

@@ -29,12 +29,6 @@ def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts, max_dataset_bytes=MAX_BYTES, max_body_bytes=1024)
 
 
-@pytest.fixture(scope="module")
-def http(service):
-    with httpx.Client(base_url=service.http, timeout=300) as client:
-        yield client
-
-
 def points_of(answer):
     length = int.from_bytes(answer.content[:4], "little")
     assert (4 + length) % 8 == 0

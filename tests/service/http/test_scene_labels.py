@@ -4,7 +4,6 @@ import base64
 import json
 
 import cv2
-import httpx
 import nibabel
 import numpy as np
 import pytest
@@ -24,12 +23,6 @@ NAMES = {"1": "left", "2": "right"}
 @pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts, api_keys=KEY)
-
-
-@pytest.fixture
-def http(service):
-    with httpx.Client(base_url=service.http, timeout=300, headers={"Authorization": f"Bearer {KEY}"}) as client:
-        yield client
 
 
 def halves(left=1, right=2):  # a PNG file

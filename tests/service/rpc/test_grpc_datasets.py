@@ -22,9 +22,8 @@ def service(start_service, artifacts):
 
 
 @pytest.fixture(scope="module")
-def datasets(service):
-    with service.channel() as channel:
-        yield datasets_pb2_grpc.DatasetServiceStub(channel)
+def datasets(channel):
+    return datasets_pb2_grpc.DatasetServiceStub(channel)
 
 
 @pytest.fixture

@@ -15,14 +15,13 @@ WAIT_S = 300.0
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service, artifacts):
+def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts, embedded_worker=False)
 
 
 @pytest.fixture(scope="module")
-def jobs(jobs_service):
-    with jobs_service.channel() as channel:
-        yield jobs_pb2_grpc.JobServiceStub(channel)
+def jobs(channel):
+    return jobs_pb2_grpc.JobServiceStub(channel)
 
 
 def training_poses(**changes):
