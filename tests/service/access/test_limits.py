@@ -28,7 +28,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import USAGE
 
 from ...waiting import wait_until
-from ..cli.command_line import run
+from ..cli.command_line import run, succeeded
 from ..conftest import RunningService, split
 from ..igtl.conftest import Peer, address_of
 from ..rpc.test_grpc_render import error_info, moved
@@ -51,9 +51,8 @@ def test_a_limit_that_cannot_be_is_refused_with_what_was_given(text):
 def test_a_key_keeps_limits_of_its_own(tmp_path):
     where = ("--artifact-folder", tmp_path)
     limits = ("--limit", "frames_per_s=30", "--limit", "stored_gb=1.5", "--limit", "streams=none")
-    made = run("keys", "create", "robot", "--role", "reader", *limits, *where)
-    assert made.exit_code == 0, made.stderr
-    assert run("keys", "create", "alice", "--role", "admin", *where).exit_code == 0
+    succeeded("keys", "create", "robot", "--role", "reader", *limits, *where)
+    succeeded("keys", "create", "alice", "--role", "admin", *where)
     robot, alice = json.loads(run("keys", "list", "--json", *where).stdout)
     assert robot["limits"] == {"frames_per_s": 30, "stored_gb": 1.5, "streams": None}
     assert alice["limits"] == {}

@@ -24,7 +24,7 @@ from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings
 from ultragray_workers.scene_shelf import SCENES_FOLDER
 
-from .command_line import python, refused, run
+from .command_line import python, refused, run, succeeded
 
 SILENT = ("serve", "worker")  # they tell in a log
 
@@ -48,8 +48,7 @@ FIRST_WORDS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS))
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command):
-    result = run(*command.split(), "--help")
-    assert result.exit_code == 0
+    result = succeeded(*command.split(), "--help")
     assert f"Usage: root {command}" in result.output
     assert "Examples" in result.output
     lines = re.findall(r"^ (?:\w+=\S+ )?ultragray ([a-z].*)$", result.output, re.MULTILINE)
@@ -107,8 +106,7 @@ def test_the_defaults_that_serve_names_are_those_of_the_settings():
 
 
 def test_show_tells_what_the_file_says(scene_file):
-    result = run("show", scene_file, "--json")
-    assert result.exit_code == 0
+    result = succeeded("show", scene_file, "--json")
     document = json.loads(result.output)
     assert document["sha256"] == file_sha256(scene_file)
     assert document["gaussian_count"] == 60
@@ -138,15 +136,14 @@ def released(tmp_path, random_scene, random_poses):
 def test_import_of_a_checkpoint_writes_a_scene(released):
     output = released / "scene.ugr"
     common = ("import", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
-    result = run(*common, "--poses", released / "poses_train.npy")
-    assert result.exit_code == 0, result.output
+    succeeded(*common, "--poses", released / "poses_train.npy")
     scene = GaussianScene.load(output)
     assert scene.info.probe == LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=45.0)
     assert len(scene.training_poses) == 4
     assert f"{output} exists: --force replaces it" in refused(*common, "--centered")
-    assert run(*common, "--force", "--center", "-1", "2.5", "-3e2").exit_code == 0
+    succeeded(*common, "--force", "--center", "-1", "2.5", "-3e2")
     assert GaussianScene.load(output).info.centre_mm == (-1.0, 2.5, -300.0)
-    assert run(*common, "--force", "--centered", "--image-height", 5).exit_code == 0
+    succeeded(*common, "--force", "--centered", "--image-height", 5)
     assert GaussianScene.load(output).info.image_height == 5
 
 
@@ -165,7 +162,7 @@ def test_import_of_a_checkpoint_says_what_it_needs(released):
 
 def test_demo_writes_the_demo_scene(tmp_path):
     output = tmp_path / "d.ugr"
-    assert run("demo", "-o", output).exit_code == 0
+    succeeded("demo", "-o", output)
     assert output.read_bytes() == DEMO_FILE.read_bytes()
     assert "folder that exists" in refused("demo", "-o", tmp_path / "absent" / "d.ugr")
     assert "output must end in .ugr, got 'd.txt'" in refused("demo", "-o", tmp_path / "d.txt")

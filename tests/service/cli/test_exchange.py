@@ -17,7 +17,7 @@ from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
 from ...workers.jobs.conftest import store_dataset
-from .command_line import noise_sweep, refused, run
+from .command_line import noise_sweep, refused, run, succeeded
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_ply_and_back_is_the_same_file(make_file, tmp_path):
     result = run("export", scene, "-o", tmp_path / "a.ply")
     assert (result.exit_code, result.stderr) == (0, "")
     assert "60 Gaussians, 5 training poses" in result.stdout
-    assert run("import", tmp_path / "a.ply", "-o", tmp_path / "b.ugr").exit_code == 0
+    succeeded("import", tmp_path / "a.ply", "-o", tmp_path / "b.ugr")
     assert (tmp_path / "b.ugr").read_bytes() == scene.read_bytes()
 
 
@@ -48,8 +48,8 @@ def test_a_compressed_scene_is_a_scene_file_itself(make_file, tmp_path):
     assert f"{small.stat().st_size / 1e6:.2f} MB" in result.stdout
     assert small.read_bytes() == GaussianScene.load(scene).to_compressed_bytes()
     assert json.loads(run("show", small, "--json").stdout)["gaussian_count"] == 60
-    assert run("render", small, "-o", tmp_path / "frames.npz").exit_code == 0
-    assert run("export", small, "-o", tmp_path / "a.ply").exit_code == 0
+    succeeded("render", small, "-o", tmp_path / "frames.npz")
+    succeeded("export", small, "-o", tmp_path / "a.ply")
 
 
 def test_a_scene_is_given_a_mode_of_motion_and_rendered_at_a_phase(make_file, tmp_path):
@@ -72,17 +72,15 @@ def test_a_checkpoint_and_back_by_the_documented_commands(make_file, tmp_path):
     result = run("export", make_file(), "-o", folder / "ckpt_0.pt")
     assert (result.exit_code, result.stderr) == (0, "")
     assert all(str(folder / name) in result.stdout for name in ("ckpt_0.pt", "conf.json", "poses_train.npy"))
-    back = run(
+    back = succeeded(
         *("import", folder / "ckpt_0.pt", "--config", folder / "conf.json"),
         *("--poses", folder / "poses_train.npy", "-o", tmp_path / "back.ugr"),
     )
-    assert back.exit_code == 0, back.output
     assert "60 Gaussians" in back.stdout
 
 
 def test_what_the_released_format_cannot_hold_is_noted(make_file, tmp_path):
-    result = run("export", make_file(intensity="sigmoid"), "-o", tmp_path / "out" / "ckpt.pt")
-    assert result.exit_code == 0
+    result = succeeded("export", make_file(intensity="sigmoid"), "-o", tmp_path / "out" / "ckpt.pt")
     assert result.stderr.startswith("note: its intensities are `sigmoid`")
 
 
@@ -92,8 +90,7 @@ def folder(tmp_path):
 
 
 def test_check_prints_a_table_and_warnings(folder):
-    result = run("check", folder, "--train-frames", "0:4,8:10")
-    assert result.exit_code == 0, result.output
+    result = succeeded("check", folder, "--train-frames", "0:4,8:10")
     assert "tiny: linear probe (width 40 mm, near 0 mm, far 50 mm)" in result.output
     assert [line.split()[-2:] for line in result.output.splitlines() if line.startswith("frames ")] == [["6", "2"]]
     assert "held-out frames lie 1.50 mm (median) to 2.00 mm" in result.output
@@ -101,8 +98,7 @@ def test_check_prints_a_table_and_warnings(folder):
     poses = np.load(folder / "poses_train.npy")
     poses[4, 0, 3] = 30.0
     np.save(folder / "poses_train.npy", poses)
-    result = run("check", folder)
-    assert result.exit_code == 0
+    result = succeeded("check", folder)
     assert "warning: train: frame 4 lies 30.0 mm off" in result.output
 
 
@@ -111,8 +107,7 @@ def test_a_sweep_of_any_size_is_described_and_its_warnings_are_the_same_at_every
     poses = np.load(folder / "poses_train.npy")
     poses[4, :3, 3] = 600.0, 300.0, 1900.0
     np.save(folder / "poses_train.npy", poses)
-    result = run("check", folder)
-    assert result.exit_code == 0, result.output
+    result = succeeded("check", folder)
     assert "crossed voxels, mL (voxel, mm)" in result.output
     assert "Probe → Tracker: pose of poses_train.npy, tracked" in result.output
     document = json.loads(run("check", folder, "--json").output)
@@ -130,8 +125,7 @@ def test_convert_leaves_names_out(folder):
         images[:, 1:6, 2:15][:, ::4] = 0
         np.save(folder / f"images_{part}.npy", images)
     output = folder.parent / "nobody"
-    result = run("convert", folder, "-o", output, "--anonymize", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeeded("convert", folder, "-o", output, "--anonymize", "--json")
     assert json.loads(result.output)["blackened_marks"] == 1
     assert json.loads((output / "conf.json").read_text())["_source"] == "anonymous"
     assert np.load(output / "images_train.npy")[:, 2:5, 3:14].max() == 0
@@ -155,32 +149,29 @@ def test_says_that_the_phantom_takes_time(folder, monkeypatch):
 
 
 def test_convert_writes_what_is_read_back(folder):
-    result = run("convert", folder, "-o", folder.parent / "half", "--image-size", "8x10", "--val-frames", "0:2")
-    assert result.exit_code == 0, result.output
+    result = succeeded("convert", folder, "-o", folder.parent / "half", "--image-size", "8x10", "--val-frames", "0:2")
     assert "8 training and 2 held-out frames of 8x10" in result.output
     assert load_dataset(folder.parent / "half").train.images.shape == (8, 10, 8)
     assert "new or empty folder" in refused("convert", folder, "-o", folder.parent / "half")
-    assert run("convert", folder, "-o", folder.parent / "half", "--force").exit_code == 0
+    succeeded("convert", folder, "-o", folder.parent / "half", "--force")
     assert load_dataset(folder.parent / "half").sha256 == load_dataset(folder).sha256
 
 
 def test_draw_draws_a_png(folder):
     picture = folder.parent / "sweep.png"
-    result = run("draw", folder, "-o", picture)
-    assert result.exit_code == 0, result.output
+    succeeded("draw", folder, "-o", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     path = tmp_path_factory.mktemp("demo") / "demo.ugr"
-    assert run("demo", "-o", path).exit_code == 0
+    succeeded("demo", "-o", path)
     return path
 
 
 def test_a_scene_becomes_a_volume_over_its_bounds(demo, tmp_path):
-    result = run("voxelize", demo, "-o", tmp_path / "v.nii.gz", "--spacing-mm", 3, "--field", "labels", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeeded("voxelize", demo, "-o", tmp_path / "v.nii.gz", "--spacing-mm", 3, "--field", "labels", "--json")
     document = json.loads(result.stdout)
     image = nibabel.load(tmp_path / "v.nii.gz")
     assert list(image.shape) == document["shape"]
@@ -192,16 +183,14 @@ def test_a_scene_becomes_a_volume_over_its_bounds(demo, tmp_path):
 
 def test_a_slice_through_a_plane(demo, tmp_path):
     plane = ("--plane-mm=-20,0,5", "--right", "1,0,0", "--down", "0,0.2,1", "--size-mm", "40,30", "--spacing-mm", 1)
-    result = run("voxelize", demo, "-o", tmp_path / "s.npy", *plane)
-    assert result.exit_code == 0, result.output
+    result = succeeded("voxelize", demo, "-o", tmp_path / "s.npy", *plane)
     assert "echo, 40 x 30 x 1 at 1 mm" in result.stdout
     assert np.load(tmp_path / "s.npy").shape == (30, 40)
 
 
 def test_a_box_beyond_the_scene_is_warned_of(demo, tmp_path):
     box = ("--box-mm", "5000:5010,0:10,0:10", "--spacing-mm", 5)
-    result = run("voxelize", demo, "-o", tmp_path / "v.nii", *box)
-    assert result.exit_code == 0, result.output
+    result = succeeded("voxelize", demo, "-o", tmp_path / "v.nii", *box)
     assert "box_mm lies beyond all Gaussians, which are in -" in result.stderr
     assert "warning" not in run("voxelize", demo, "-o", tmp_path / "w.nii", "--spacing-mm", 8).stderr
 
@@ -222,8 +211,7 @@ def frame(tmp_path):
 def test_the_pose_is_found_and_written(frame, tmp_path):
     path, pose = frame
     found = tmp_path / "found.npy"
-    result = run("localize", DEMO_FILE, path, "--start", tmp_path / "start.npy", "-o", found, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeeded("localize", DEMO_FILE, path, "--start", tmp_path / "start.npy", "-o", found, "--json")
     document = json.loads(result.stdout)
     assert document["is_found"]
     np.testing.assert_allclose(document["pose"], pose, atol=0.2)
@@ -268,8 +256,7 @@ def test_points_are_registered_and_residuals_told(tmp_path):
     np.savetxt(tmp_path / "base.csv", points, delimiter=",")
     np.save(tmp_path / "scene.npy", points @ true[:3, :3].T + true[:3, 3])
     output = tmp_path / "robot.json"
-    result = run("calibrate", "points", tmp_path / "base.csv", tmp_path / "scene.npy", "-o", output)
-    assert result.exit_code == 0, result.output
+    result = succeeded("calibrate", "points", tmp_path / "base.csv", tmp_path / "scene.npy", "-o", output)
     assert "from 5 points" in result.stdout
     assert "residuals: " in result.stdout
     np.testing.assert_allclose(load_registration(output).base_to_scene, true, atol=1e-9)
@@ -325,8 +312,7 @@ def test_frames_register_a_robot(tmp_path):
     about[:3, 3] += (1.0, -1.0, 0.5)
     np.save(tmp_path / "about.npy", about)
     asked = ("calibrate", "frames", DEMO_FILE, tmp_path / "flange.npy", tmp_path / "frames.npy")
-    result = run(*asked, "--start", tmp_path / "about.npy", "-o", tmp_path / "robot.json", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeeded(*asked, "--start", tmp_path / "about.npy", "-o", tmp_path / "robot.json", "--json")
     document = json.loads(result.stdout)
     assert document["left_out"] == []
     found = np.array(document["base_to_scene"]) @ np.linalg.inv(base_to_scene) @ poses

@@ -7,15 +7,14 @@ import numpy as np
 from ultragray import PlanSettings, plan_views
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 
-from .command_line import refused, run
+from .command_line import refused, run, succeeded
 
 ASKED = ("--views", "3", "--within-mm", "0.5")
 
 
 def test_the_plan_of_the_library_is_told_and_written(tmp_path):
     written = tmp_path / "next.npy"
-    result = run("plan", DEMO_FILE, *ASKED, "-o", written, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeeded("plan", DEMO_FILE, *ASKED, "-o", written, "--json")
     plan = plan_views(load_demo_scene(), PlanSettings(views=3, within_mm=0.5))
     document = json.loads(result.stdout)
     np.testing.assert_allclose(document["gains"], plan.gains)

@@ -22,7 +22,7 @@ from ultragray.rendering.tools import Needle, ToolFrame
 from ultragray.samplers import FanSampler
 from ultragray.scene.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
 
-from .command_line import refused, run
+from .command_line import refused, run, succeeded
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 
@@ -33,11 +33,10 @@ CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_m
 
 def test_render_writes_an_npz_that_can_be_replayed(scene_file, pose_file, tmp_path):
     output = tmp_path / "frames.npz"
-    result = run(
+    result = succeeded(
         *("render", scene_file, "--poses", pose_file, "--height", 16, "--width", 12),
         *("--outputs", "bmode,transmittance", "-o", output),
     )
-    assert result.exit_code == 0, result.output
     assert "7 frames of 16x12" in result.output
     with np.load(output) as frames:
         told = {field.name for field in fields(SettingsUsed)}
@@ -53,7 +52,7 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file, pose_file, tmp_pa
 
 
 def test_without_poses_the_training_views_are_rendered_as_trained(scene_file, tmp_path):
-    assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
+    succeeded("render", scene_file, "-o", tmp_path / "f.npz")
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["bmode"].shape == (5, 24, 20)
 
@@ -61,7 +60,7 @@ def test_without_poses_the_training_views_are_rendered_as_trained(scene_file, tm
 def test_display_settings_vary_within_a_batch_and_are_told(scene_file, tmp_path):
     output = tmp_path / "f.npz"
     line = ("render", scene_file, "--gain-db", "-6:6", "--display-seed", 3, "--height", 16, "--width", 12, "-o", output)
-    assert run(*line).exit_code == 0
+    succeeded(*line)
     with np.load(output) as frames:
         display = from_dict(Display, json.loads(str(frames["display"])))
         assert display == Display(gain_db_between=(-6.0, 6.0), display_seed=3)
@@ -75,8 +74,8 @@ def test_display_settings_vary_within_a_batch_and_are_told(scene_file, tmp_path)
 def test_render_writes_pngs(scene_file, tmp_path):
     folder, npz = tmp_path / "pictures", tmp_path / "f.npz"
     arguments = ("render", scene_file, "--outputs", "bmode,coverage", "-o")
-    assert run(*arguments, folder).exit_code == 0
-    assert run(*arguments, npz).exit_code == 0
+    succeeded(*arguments, folder)
+    succeeded(*arguments, npz)
     names = sorted(p.name for p in folder.iterdir())
     pictures = [f"frame_{i:05d}_{output}.png" for i in range(5) for output in ("bmode", "coverage")]
     assert names == [*pictures, "frames.json"]
@@ -124,7 +123,7 @@ def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
     file, output = tmp_path / "tools.json", tmp_path / "f.npz"
     file.write_text(json.dumps(to_dict((needle,))))
     arguments = ("render", scene_file, "-o", output, "--outputs", "bmode,labels", "--tools", file)
-    assert run(*arguments, "--ghost", 0.5).exit_code == 0
+    succeeded(*arguments, "--ghost", 0.5)
     size = {"height": 24, "width": 20, "outputs": ("bmode", "labels")}
     expected = render(scene, None, scene.training_poses, **size, tools=(needle,), ghost=0.5)
     with np.load(output) as frames:
@@ -141,7 +140,7 @@ def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
 def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
     scene = GaussianScene.load(knowing_file)
     arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", 0.5)
-    assert run(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8).exit_code == 0
+    succeeded(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8)
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["confidence"].shape == (30,)
         assert frames["confidence"].min() >= 0.5
@@ -150,8 +149,7 @@ def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
     poses[3, :3, 3] += 50.0 * poses[3, :3, 1]
     np.save(tmp_path / "far.npy", poses)
     assert "poses[3] has a confidence of" in refused(*arguments, "--poses", tmp_path / "far.npy")
-    kept = run(*arguments, "--poses", tmp_path / "far.npy", "--sampler", "training")
-    assert kept.exit_code == 0, kept.output
+    succeeded(*arguments, "--poses", tmp_path / "far.npy", "--sampler", "training")
     with np.load(tmp_path / "f.npz") as frames:
         np.testing.assert_array_equal(frames["poses"], poses[[0, 1, 2, 4]])
     assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
@@ -160,8 +158,7 @@ def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
 def test_render_samples_poses_into_the_format_of_the_name(scene_file, pose_file, tmp_path):
     sampler = ("--sampler", "fan", "--tilt-deg", 2, "--step-deg", 2, "--poses", pose_file)
     for name in ("f.npz", "f.igs.mha", "f.h5"):
-        result = run("render", scene_file, *sampler, "--dtype", "uint8", "-o", tmp_path / name)
-        assert result.exit_code == 0, result.output
+        result = succeeded("render", scene_file, *sampler, "--dtype", "uint8", "-o", tmp_path / name)
         assert "21 frames of 24x20" in result.output
     with np.load(tmp_path / "f.npz") as frames:
         np.testing.assert_array_equal(frames["poses"], FanSampler(2, 2).poses(np.load(pose_file), LINEAR))
@@ -173,8 +170,7 @@ def test_render_samples_poses_into_the_format_of_the_name(scene_file, pose_file,
 
 
 def test_threads_and_backend_are_used(scene_file, tmp_path):
-    result = run("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
-    assert result.exit_code == 0
+    succeeded("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
     assert torch.get_num_threads() == 3
     with np.load(tmp_path / "f.npz") as frames:
         assert str(frames["renderer"]).endswith(" reference")

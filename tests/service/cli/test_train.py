@@ -24,7 +24,7 @@ from ultragray.learn.training import TrainingConfig, batch, train
 from ultragray.learn.training.geometry import Geometry
 
 from ...waiting import Deadline
-from .command_line import refused, run
+from .command_line import refused, run, succeeded
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
 
@@ -41,8 +41,7 @@ def refused_run(*arguments):
 
 def test_trains_a_scene(dataset, tmp_path):
     output = tmp_path / "scene.ugr"
-    result = run("train", dataset, "-o", output, *SMALL)
-    assert result.exit_code == 0, result.output
+    result = succeeded("train", dataset, "-o", output, *SMALL)
     scene = GaussianScene.load(output)
     assert scene.gaussian_count == 60
     assert scene.info.probe == LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
@@ -65,8 +64,7 @@ def test_settings_come_from_file_set_and_options(dataset, tmp_path):
     file.write_text('preset = "paper"\nsteps = 3\nmax_gaussians = 40\nmeans_rate = 3e-4\nquats_rate = 1e-3\n')
     settings = ("--config", file, "--set", "steps=2", "--set", "quats_rate=2e-3", "--set", "start=informed")
     options = ("--seed", 5, "--steps", 1, "--no-transmittance", "--out-of-plane", 0, "--intensity", "sigmoid")
-    result = run("train", dataset, "-o", tmp_path / "scene.ugr", *settings, *options)
-    assert result.exit_code == 0, result.output
+    succeeded("train", dataset, "-o", tmp_path / "scene.ugr", *settings, *options)
     training = GaussianScene.load(tmp_path / "scene.ugr").info.training
     assert training.pop("step") == 1
     expected = TrainingConfig.preset(
@@ -82,7 +80,7 @@ def test_settings_come_from_file_set_and_options(dataset, tmp_path):
         intensity="sigmoid",
     )
     assert TrainingConfig.from_dict(training) == expected.resolved(Geometry.of(load_dataset(dataset)))
-    assert run("train", dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast").exit_code == 0
+    succeeded("train", dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast")
     assert GaussianScene.load(tmp_path / "b.ugr").info.training["intensity"] == TrainingConfig().intensity
 
 
@@ -118,7 +116,7 @@ def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, mon
     assert f"lower max_gaussians or batch_size; the last good checkpoint is kept in {output}.run" in told
     assert f"{output} is the scene after step 5" in told
     assert GaussianScene.load(output).info.training["step"] == 5
-    assert run("train", dataset, "-o", output, "--resume").exit_code == 0
+    succeeded("train", dataset, "-o", output, "--resume")
 
 
 SIGNALLED = """
@@ -160,9 +158,8 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset, tmp_path, number):
     assert f"stopped after step {stopped_at} of 12; wrote {output} as it is" in told
     assert "unfinished run: --resume continues it, --force begins anew" in refused_run(dataset, "-o", output, *small)
     assert "steps is 12 there, 50 here" in refused_run(dataset, "-o", output, "--resume", "--steps", 50)
-    resumed = run("train", dataset, "-o", output, "--resume")  # the settings are those of the run
-    assert resumed.exit_code == 0, resumed.output
-    assert run("train", dataset, "-o", tmp_path / "undisturbed.ugr", *small).exit_code == 0
+    succeeded("train", dataset, "-o", output, "--resume")  # the settings are those of the run
+    succeeded("train", dataset, "-o", tmp_path / "undisturbed.ugr", *small)
     assert output.read_bytes() == (tmp_path / "undisturbed.ugr").read_bytes()
 
 
@@ -211,8 +208,7 @@ def scene(dataset):
 
 
 def printed_json(*arguments):
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
+    result = succeeded(*arguments)
     return json.loads(result.stdout)
 
 
@@ -225,8 +221,7 @@ def test_eval_prints_what_the_library_measures(dataset, scene):
     held_out = {"as_given": means, "on_path": None, "registered": None}
     assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures, "held_out": held_out}
     assert "is for held-out frames" in refused("eval", scene, dataset, "--split", "train", "--register")
-    result = run("eval", scene, dataset)
-    assert result.exit_code == 0
+    result = succeeded("eval", scene, dataset)
     mean, std = expected.mean, expected.std
     assert f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}" in result.stdout
     assert f"{mean.gmsd:.3f} ± {std.gmsd:.3f}" in result.stdout
@@ -237,8 +232,7 @@ def test_eval_prints_what_the_library_measures(dataset, scene):
 
 
 def test_eval_writes_pictures(dataset, scene, tmp_path):
-    result = run("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
-    assert result.exit_code == 0
+    result = succeeded("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
     assert len(json.loads(result.stdout)["frames"]) == 2
     assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
     assert (tmp_path / "pictures" / "uncertainty.svg").read_text().startswith("<svg")
@@ -246,8 +240,7 @@ def test_eval_writes_pictures(dataset, scene, tmp_path):
 
 def test_report_of_a_scene(dataset, scene, tmp_path):
     page = tmp_path / "page.html"
-    result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
-    assert result.exit_code == 0, result.output
+    result = succeeded("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
     assert result.stdout == f"wrote {page}\n"
     mean = evaluate(GaussianScene.load(scene), read_released(dataset).val).mean
     assert f"{mean.psnr_db:.2f} ±" in page.read_text()
@@ -292,8 +285,7 @@ CLASSICAL = ("--methods", "median,linear,nearest")
 def test_the_table_has_what_the_library_measures(dataset, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     expected = evaluate_baselines(read_released(dataset), ("median", "linear", "nearest"))
-    result = run("compare", dataset, *CLASSICAL)
-    assert result.exit_code == 0, result.output
+    result = succeeded("compare", dataset, *CLASSICAL)
     assert "ball, 2 val frames" in result.stdout
     for title, name in {"median compounding, 0.5 mm": "median", "linear between frames": "linear"}.items():
         mean = expected[name].mean
@@ -306,8 +298,7 @@ def test_the_table_has_what_the_library_measures(dataset, tmp_path, monkeypatch)
 
 def test_a_page_with_its_table_as_json_and_latex(dataset, tmp_path):
     page = tmp_path / "ball.html"
-    result = run("compare", dataset, *CLASSICAL, "-o", page)
-    assert result.exit_code == 0, result.output
+    result = succeeded("compare", dataset, *CLASSICAL, "-o", page)
     assert "linear between frames" in page.read_text()
     assert len(json.loads((tmp_path / "ball.json").read_text())["results"]) == 3
     assert r"\toprule" in (tmp_path / "ball.tex").read_text()
@@ -317,8 +308,7 @@ def test_a_page_with_its_table_as_json_and_latex(dataset, tmp_path):
 def test_a_comparison_over_seeds_has_error_bars(dataset, tmp_path):
     page = tmp_path / "ball.html"
     line = ("compare", dataset, "--methods", "linear,nearest", "--seeds", 2, "--seed", 7, "-o", page)
-    result = run(*line)
-    assert result.exit_code == 0, result.output
+    result = succeeded(*line)
     assert "2 seeds from 7" in result.stdout
     assert re.search(r"linear between frames +\d+\.\d\d ± 0\.00 +\d\.\d{3} ± 0\.000", result.stdout)
     document = json.loads((tmp_path / "ball.json").read_text())
@@ -326,7 +316,7 @@ def test_a_comparison_over_seeds_has_error_bars(dataset, tmp_path):
     means = [one["results"][0]["evaluation"]["mean"]["psnr_db"] for one in document["seeds"]]
     assert document["over_seeds"]["linear between frames"]["psnr_db"]["mean"] == pytest.approx(np.mean(means))
     assert (tmp_path / "ball.svg").read_text().startswith("<svg")
-    assert run(*line).exit_code == 0  # goes on with what is there
+    succeeded(*line)
     means = json.loads(run(*line[:-2], "--json").stdout)["over_seeds"]
     assert means == document["over_seeds"]
 
@@ -341,7 +331,7 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
     result = run("compare", tmp_path / "wide", "--methods", "median-0.25mm")
     assert result.exit_code == 1
     assert "voxel" in result.stdout
-    assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
+    succeeded("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest")
 
 
 def test_what_is_not_a_comparisons_is_not_replaced(dataset, tmp_path):

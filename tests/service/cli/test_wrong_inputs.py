@@ -10,7 +10,7 @@ import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
 
-from .command_line import noise_sweep, python, run
+from .command_line import noise_sweep, python, run, succeeded
 
 SOURCES = str(Path(__file__).resolve().parents[3])
 NOBODY = "http://127.0.0.1:9"  # the port of `discard`, where nobody listens
@@ -238,6 +238,5 @@ def test_a_mistake_is_told_before_torch_is_imported(place):
 )
 def test_a_misspelt_variable_is_told(variable, meant, place, monkeypatch):
     monkeypatch.setenv(variable, "1")
-    result = run("show", place / "scene.ugr", "--json")
-    assert result.exit_code == 0
+    result = succeeded("show", place / "scene.ugr", "--json")
     assert f"the environment variable {variable} is not known and is ignored{meant}\n" in result.stderr
