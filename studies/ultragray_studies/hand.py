@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from ultragray.geometry.probe import FloatArray, LinearProbe
-from ultragray.geometry.rotations import rotations_of
+from ultragray.geometry.rotations import rotations_of, transforms_of
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep
 from ultragray.phantom import simulate
 
@@ -58,10 +58,8 @@ class Hand:
 
     def poses(self, times_s: FloatArray) -> FloatArray:  # [F] -> [F, 4, 4] mm
         sways, along_mm = self.at(self._sways, times_s), self.at(self._along_mm[:, None], times_s)[:, 0]
-        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-        poses[:, :3, :3] = self._axes @ rotations_of(np.radians(sways[:, 3:]))
-        poses[:, :3, 3] = (sways[:, :3] + along_mm[:, None] * (0.0, 1.0, 0.0)) @ self._axes.T
-        return poses
+        shifts = (sways[:, :3] + along_mm[:, None] * (0.0, 1.0, 0.0)) @ self._axes.T
+        return transforms_of(self._axes @ rotations_of(np.radians(sways[:, 3:])), shifts)
 
     def dragging_mm(self, times_s: FloatArray) -> FloatArray:  # [F] -> [F, 3]
         """The sways along the axes of the probe that drag the tissue, which slips back under slower ones."""
@@ -143,9 +141,7 @@ def _times_s(count: int) -> FloatArray:  # [F]
 
 def _moved(poses: FloatArray, by: FloatArray) -> FloatArray:  # [F, 4, 4] mm, [F or 1, 6] mm, degrees
     """The poses, moved in the frame of the probe."""
-    motions = np.tile(np.eye(4), (len(by), 1, 1))
-    motions[:, :3, :3], motions[:, :3, 3] = rotations_of(np.radians(by[:, 3:])), by[:, :3]
-    moved: FloatArray = poses @ motions
+    moved: FloatArray = poses @ transforms_of(rotations_of(np.radians(by[:, 3:])), by[:, :3])
     return moved
 
 

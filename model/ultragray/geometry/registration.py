@@ -17,6 +17,7 @@ from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.files import require_version, write_whole
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import transforms_of
 
 LEAST_POINTS = 3
 LEAST_SPREAD = 1e-3  # of the longest extent of the points, across it: less is a line
@@ -58,9 +59,7 @@ def register_points(points: Any, targets: Any) -> PointFit:  # [N, 3] mm both
             )
     middle, target_middle = points.mean(axis=0), targets.mean(axis=0)
     rotation = _rotation(points - middle, targets - target_middle)
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = target_middle - rotation @ middle
+    transform = transforms_of(rotation, target_middle - rotation @ middle)
     centred = (points - middle) @ rotation.T
     left = centred - (targets - target_middle)
     position_std_mm, angle_std_deg = _deviations(centred, left)
@@ -183,9 +182,7 @@ def register_poses_and_mounting(flange_to_base: Any, probe_to_scene: Any) -> Pos
     rotation = right.T @ np.diag([1.0, 1.0, np.linalg.det(right.T @ left.T)]) @ left.T
     left_side = (flange_moves[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     right_side = (probe_moves[:, :3, 3] @ rotation.T - flange_moves[:, :3, 3]).reshape(-1)
-    mounting = np.eye(4)
-    mounting[:3, :3] = rotation
-    mounting[:3, 3] = np.linalg.lstsq(left_side, right_side, rcond=None)[0]
+    mounting = transforms_of(rotation, np.linalg.lstsq(left_side, right_side, rcond=None)[0])
     return register_poses(flanges, probes, mounting)
 
 

@@ -1,4 +1,4 @@
-"""Rotations of many poses at once, and the angles between them."""
+"""Rotations of many poses at once, the angles between them, and the transforms that they are part of."""
 
 from __future__ import annotations
 
@@ -43,6 +43,13 @@ def turns_of(rotations: FloatArray) -> FloatArray:  # [C, 3, 3] -> [C, 3] rad
     """Axis times angle, at most π, of each rotation."""
     axes, angles = _axes_and_angles(rotations)
     return axes * angles[:, None]
+
+
+def transforms_of(rotations: FloatArray, shifts: FloatArray) -> FloatArray:  # [..., 3, 3], [..., 3] -> [..., 4, 4]
+    """The transforms that first rotate and then shift; shapes broadcast."""
+    transforms = np.zeros((*np.broadcast_shapes(rotations.shape[:-2], shifts.shape[:-1]), 4, 4))
+    transforms[..., :3, :3], transforms[..., :3, 3], transforms[..., 3, 3] = rotations, shifts, 1.0
+    return transforms
 
 
 def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]

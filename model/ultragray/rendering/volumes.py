@@ -18,6 +18,7 @@ from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import MAX_POSITION_MM
 from ultragray.geometry.probe import FloatArray, Picture
+from ultragray.geometry.rotations import transforms_of
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import SceneInfo
 
@@ -130,18 +131,12 @@ class VolumeGrid:
     @property
     def pose(self) -> FloatArray:  # [4, 4] mm
         """Of its first layer: the centre of the first pixel, x along rows, z along columns, y against the normal."""
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([self.axes[0], -self.axes[2], self.axes[1]], axis=1)
-        pose[:3, 3] = self.origin_mm
-        return pose
+        return transforms_of(np.stack([self.axes[0], -self.axes[2], self.axes[1]], axis=1), self.origin_mm)
 
     @property
     def affine(self) -> FloatArray:  # [4, 4]
         """From voxel (i, j, k, 1) to mm in the scene's frame."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.axes.T * self.spacing_mm
-        matrix[:3, 3] = self.origin_mm
-        return matrix
+        return transforms_of(self.axes.T * self.spacing_mm, self.origin_mm)
 
 
 def parse_numbers(text: str, count: int, field: str) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from ultragray.contract import Contract, Family, described, from_dict, kind_fiel
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import MAX_POSITION_MM
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import rotations_of
+from ultragray.geometry.rotations import rotations_of, transforms_of
 from ultragray.scene.shapes import Shape, point_field, read_document, turn_field
 from ultragray.scene.tissues import TISSUES
 
@@ -56,11 +56,8 @@ class Motion(Contract):
 
     @property
     def motion(self) -> FloatArray:  # [4, 4] mm
-        motion = np.eye(4)
-        motion[:3, :3] = rotations_of(np.radians([self.turn_deg]))[0]
-        about = np.asarray(self.about_mm)
-        motion[:3, 3] = about - motion[:3, :3] @ about + np.asarray(self.shift_mm)
-        return motion
+        rotation, about = rotations_of(np.radians([self.turn_deg]))[0], np.asarray(self.about_mm)
+        return transforms_of(rotation, about - rotation @ about + np.asarray(self.shift_mm))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import BoolArray, FloatArray, Probe
-from ultragray.geometry.rotations import about_axes
+from ultragray.geometry.rotations import about_axes, transforms_of
 from ultragray.geometry.scan_conversion import interpolated
 from ultragray.learn.planning.settings import Box, PlanSettings, box_of
 from ultragray.rendering.contact import Skin, Touch
@@ -129,10 +129,7 @@ def _held(surface: _Surface, places: FloatArray, angles: FloatArray, probe: Prob
 
 def _with_faces(points: FloatArray, rotations: FloatArray, probe: Probe) -> FloatArray:  # [C, 3], [C, 3, 3]
     """Poses [C, 4, 4] whose faces have their middles at points."""
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = points - probe.pivot_depth_mm * rotations[:, :, 2]
-    return poses
+    return transforms_of(rotations, points - probe.pivot_depth_mm * rotations[:, :, 2])
 
 
 def _faces(poses: FloatArray, probe: Probe) -> FloatArray:  # [C, 4, 4] -> [C, 3] mm

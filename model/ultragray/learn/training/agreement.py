@@ -29,7 +29,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.geometry.rotations import blended, mean_axes, rotations_of, turns_of
+from ultragray.geometry.rotations import blended, mean_axes, rotations_of, transforms_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_sharply
 from ultragray.learn.prediction import blend_by_distance, blend_in_time, frame_times, seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
@@ -242,11 +242,9 @@ def _with_steps(
         moved = own.copy()
         for place, motion in enumerate(motions):
             moved[place + 1] = moved[place] @ motion
-        back = np.eye(4)
-        back[:3, :3] = mean_axes(own @ np.linalg.inv(moved))
+        turn = mean_axes(own @ np.linalg.inv(moved))
         from_middle, to_middle = ((path[:, :3, :3] @ middle + path[:, :3, 3]).mean(axis=0) for path in (moved, own))
-        back[:3, 3] = to_middle - back[:3, :3] @ from_middle
-        found[frames.start : frames.stop] = back @ moved
+        found[frames.start : frames.stop] = transforms_of(turn, to_middle - turn @ from_middle) @ moved
     return found
 
 

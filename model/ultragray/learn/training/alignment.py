@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.rotations import mean_axes, rotations_of, turns_of
+from ultragray.geometry.rotations import mean_axes, rotations_of, transforms_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
 from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 
@@ -278,10 +278,8 @@ class _Match:
         return self._motion(here) if gain >= LEAST_GAIN and reached >= self._least_correlation else None
 
     def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
-        motion = np.eye(4)
-        motion[:3, :3] = rotations_of(np.radians(self._axes @ numbers[:3])[None])[0]
-        motion[:3, 3] = self._centre - motion[:3, :3] @ self._centre + self._axes @ numbers[3:]
-        return motion
+        turn = rotations_of(np.radians(self._axes @ numbers[:3])[None])[0]
+        return transforms_of(turn, self._centre - turn @ self._centre + self._axes @ numbers[3:])
 
     def _correlation(self, details: Sequence[HalfArray], numbers: FloatArray) -> float:
         """Of the true and the predicted details of both sides; −∞ where they have too little in common."""
