@@ -35,6 +35,7 @@ class Mounted:
         self.authority.cert_pem.write_to_path(self.root)
         for name in (SERVER, KEY, AUTHORITY):
             (folder / name).symlink_to(Path("..data", name))
+        self.put(self.issue())
 
     def put(self, server, *, clients=None, key=None):
         """Replaces all files in one step. `key` None: that of the certificate."""

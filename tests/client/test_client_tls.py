@@ -15,9 +15,7 @@ from .conftest import KEY
 
 @pytest.fixture(scope="module")
 def mounted(tmp_path_factory):
-    found = Mounted(tmp_path_factory.mktemp("certificates") / "tls")
-    found.put(found.issue())
-    return found
+    return Mounted(tmp_path_factory.mktemp("certificates") / "tls")
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,11 @@ from ..surroundings import ROOT
 from .blocks import read_page
 from .running import PageRun
 
+DOCUMENTS = sorted(
+    path
+    for pattern in ("*.md", "docs/**/*.md", "*/README.md", "tests/documents/README.md")
+    for path in ROOT.glob(pattern)
+)
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 
 

@@ -3,15 +3,9 @@
 import pytest
 
 from ..surroundings import ROOT
-from .conftest import TUTORIAL
+from .conftest import DOCUMENTS, TUTORIAL
 
-DOCUMENTS = sorted(
-    path
-    for pattern in ("*.md", "docs/**/*.md", "*/README.md", "tests/documents/README.md")
-    for path in ROOT.glob(pattern)
-    if path.name not in ("CHANGELOG.md", TUTORIAL.name, "extending.md")  # no commands; in test modules of their own
-)
-
+ELSEWHERE = ("CHANGELOG.md", TUTORIAL.name, "extending.md")  # no commands; in test modules of their own
 HOW_TO = ROOT / "docs/howto"  # long, with services and jobs of their own
 
 
@@ -21,6 +15,7 @@ HOW_TO = ROOT / "docs/howto"  # long, with services and jobs of their own
     [
         pytest.param(path, id=str(path.relative_to(ROOT)), marks=[pytest.mark.long] if HOW_TO in path.parents else [])
         for path in DOCUMENTS
+        if path.name not in ELSEWHERE
     ],
 )
 def test_blocks_run(path, run_page):

@@ -3,11 +3,11 @@
 import ast
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
 from ..surroundings import ROOT
+from .conftest import DOCUMENTS
 
 LOADING = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "link": "href"}
 LEADING = {"canonical", "prev", "next", "alternate"}  # links in a page's head that load nothing
@@ -55,11 +55,6 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(generator, tmp_path):
         assert not [source for source in sources if foreign.match(source)], sheet
 
 
-DOCUMENTS = sorted(
-    path
-    for pattern in ("*.md", "docs/**/*.md", "*/README.md", "tests/documents/README.md")
-    for path in ROOT.glob(pattern)
-)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
@@ -86,7 +81,6 @@ def test_every_link_leads_somewhere(document):
             assert anchor in headings_of(target), f"{document.name} names {link}; {target.name} has no such heading"
 
 
-ROOT = Path(__file__).resolve().parents[2]
 TOUR = ROOT / "docs" / "tour.md"
 STOP = re.compile(r"^(\d+)\. \[(?P<shown>[^]]+)\]\(\.\./(?P<path>[^)]+)\): `(?P<name>[\w.]+)`\.", re.MULTILINE)
 

@@ -1,8 +1,6 @@
 """The examples in C and C++, built against an installed libultragray as projects of others are: frames and leaks."""
 
-import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray_client import Client
 from ultragray_client import RenderSettings as ClientSettings
 
+from ..model.library.test_builds import needs
 from ..model.library.test_library import of_python
 from .conftest import ENGINES, ROOT
 from .test_csharp import free_port
@@ -19,12 +18,6 @@ from .test_csharp import free_port
 EXAMPLES = ENGINES / "examples"
 LEAKS = ["valgrind", "--quiet", "--leak-check=full", "--errors-for-leak-kinds=all", "--error-exitcode=9"]
 pytestmark = pytest.mark.long
-
-
-def needs(*programs):
-    missing = [one for one in programs if shutil.which(one) is None]
-    if missing or not Path("/usr/include/nlohmann/json.hpp").is_file():
-        pytest.skip(f"needs Debian's nlohmann-json3-dev, and {', '.join(programs)}")
 
 
 def cmake(source, folder, *options):

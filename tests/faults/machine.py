@@ -31,6 +31,25 @@ SERVE = [sys.executable, "-m", "ultragray_service"]
 WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
+def environment(folder, **settings):
+    """That of a service and a worker, whose data are below a folder."""
+    patches = folder / "patches"
+    patches.mkdir()
+    (patches / "sitecustomize.py").write_text(PATCHES)
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(patches), *filter(None, sys.path)]),
+        "OMP_NUM_THREADS": "1",
+        "ULTRAGRAY_DATA_FOLDER": str(folder / "data"),
+        "ULTRAGRAY_HTTP_PORT": "0",
+        "ULTRAGRAY_GRPC_PORT": "0",
+        "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+        "ULTRAGRAY_TRAINING_THREADS": "1",
+        "ULTRAGRAY_JOB_NICE": "0",
+        **settings,
+    }
+
+
 class Machine:
     """Its processes; `tend` must be called often."""
 
@@ -42,21 +61,7 @@ class Machine:
         self._logs = folder / "logs"
         self._logs.mkdir(parents=True)
         self.data.mkdir()
-        patches = folder / "patches"
-        patches.mkdir()
-        (patches / "sitecustomize.py").write_text(PATCHES)
-        self._environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([str(patches), *filter(None, sys.path)]),
-            "OMP_NUM_THREADS": "1",
-            "ULTRAGRAY_DATA_FOLDER": str(self.data),
-            "ULTRAGRAY_HTTP_PORT": "0",
-            "ULTRAGRAY_GRPC_PORT": "0",
-            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
-            "ULTRAGRAY_TRAINING_THREADS": "1",
-            "ULTRAGRAY_JOB_NICE": "0",
-            **settings,
-        }
+        self._environment = environment(folder, **settings)
         self._servers = []
         self._workers = []
         self._with_workers = False

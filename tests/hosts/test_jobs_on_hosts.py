@@ -2,9 +2,7 @@
 
 import io
 import json
-import os
 import subprocess
-import sys
 import time
 import zipfile
 from dataclasses import replace
@@ -17,7 +15,7 @@ from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 
-from ..faults.machine import PATCHES, SERVE, WORK
+from ..faults.machine import SERVE, WORK, environment
 from ..object_storage import AWAY_S
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
@@ -30,26 +28,17 @@ class Host:
 
     def __init__(self, folder, artifacts, database_url, **settings):
         self.folder, self.data, self.cache = folder, folder / "data", folder / "cache"
-        for one in (self.data, self.cache, folder / "logs", folder / "patches"):
+        for one in (self.data, self.cache, folder / "logs"):
             one.mkdir(parents=True)
         copy_demo_scene(self.data / "demo.ugr")
-        (folder / "patches" / "sitecustomize.py").write_text(PATCHES)
-        self._environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([str(folder / "patches"), *filter(None, sys.path)]),
-            "OMP_NUM_THREADS": "1",
-            "ULTRAGRAY_DATA_FOLDER": str(self.data),
-            "ULTRAGRAY_ARTIFACT_FOLDER": artifacts,
-            "ULTRAGRAY_CACHE_FOLDER": str(self.cache),
-            "ULTRAGRAY_DATABASE_URL": database_url,
-            "ULTRAGRAY_EMBEDDED_WORKER": "false",
-            "ULTRAGRAY_HTTP_PORT": "0",
-            "ULTRAGRAY_GRPC_PORT": "0",
-            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
-            "ULTRAGRAY_TRAINING_THREADS": "1",
-            "ULTRAGRAY_JOB_NICE": "0",
+        self._environment = environment(
+            folder,
+            ULTRAGRAY_ARTIFACT_FOLDER=artifacts,
+            ULTRAGRAY_CACHE_FOLDER=str(self.cache),
+            ULTRAGRAY_DATABASE_URL=database_url,
+            ULTRAGRAY_EMBEDDED_WORKER="false",
             **settings,
-        }
+        )
         self.processes = []
 
     def serve(self):

@@ -102,9 +102,7 @@ def archived(source):
 
 @pytest.fixture(scope="module")
 def mounted(tmp_path_factory):
-    found = Mounted(tmp_path_factory.mktemp("certificates") / "tls")
-    found.put(found.issue())
-    return found
+    return Mounted(tmp_path_factory.mktemp("certificates") / "tls")
 
 
 def listed(server, **environment):

@@ -7,6 +7,4 @@ from ...certificates import Mounted
 
 @pytest.fixture
 def mounted(tmp_path):
-    found = Mounted(tmp_path / "tls")
-    found.put(found.issue())
-    return found
+    return Mounted(tmp_path / "tls")

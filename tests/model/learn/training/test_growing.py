@@ -26,14 +26,6 @@ def sweep():
     return Sweep(images, poses, PHANTOM_PROBE, np.arange(COUNT), "phantom")
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def grown(sweep, until=COUNT, steps=3):
     trainer = GrowingTrainer("phantom", PHANTOM_PROBE)
     for place in range(until):

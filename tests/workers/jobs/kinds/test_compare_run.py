@@ -7,7 +7,6 @@ import signal
 from dataclasses import replace
 
 import pytest
-import torch
 
 from ultragray.errors import ExtraMissing, InvalidArgument, MemoryExceeded, TrainingDiverged
 from ultragray.learn.evaluation.baselines import evaluate_baselines
@@ -29,7 +28,6 @@ JOB = CompareJob(dataset="tiny", methods=("median", "nearest"))
 @pytest.fixture
 def job_run(artifact_folder):
     """The run of a job."""
-    torch.set_num_threads(1)
 
     def make(job_id="job", should_stop=lambda: False):
         folder = JobFolder(artifact_folder, job_id)

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
@@ -29,7 +28,6 @@ JOB = EvaluateJob("tiny", "one")
 @pytest.fixture
 def job_run(artifact_folder, random_scene):
     """The run of a job whose folder holds its scene."""
-    torch.set_num_threads(1)
 
     def make(job=JOB, probe=PROBE, should_stop=lambda: False):
         folder = JobFolder(artifact_folder, "job")

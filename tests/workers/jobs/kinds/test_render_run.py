@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pydicom
 import pytest
-import torch
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, render
 from ultragray.contract import to_dict as to_json
@@ -34,11 +33,6 @@ MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 6, 20, 0.04).t
 OF_SUPPORT = ConfidenceModel(
     (3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 6, 20, 0.04, Support(25.0, share=0.04, reach_mm=20.0)
 ).to_dict()
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 @pytest.fixture
