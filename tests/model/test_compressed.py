@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from ultragray import GaussianScene, read_header, render
 from ultragray.errors import SceneFileInvalid
@@ -80,14 +81,7 @@ def with_checksum(part):
 
 
 def covariances(scales, quats):  # [N, 3] log, [N, 4] -> [N, 3, 3]
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    turns = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    turns = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
     return turns @ (np.exp(2.0 * scales)[..., None] * turns.transpose(0, 2, 1))
 
 

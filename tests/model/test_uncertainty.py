@@ -12,17 +12,13 @@ from ultragray.errors import InvalidArgument, UnknownOutput
 from ultragray.rendering.derived import CELLS, variance_terms
 from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
+from .test_confidence import moved
+
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 EACH = {"floor": 1.0, "level²": 0.02, "texture": 0.5, "gap 1 mm": 0.6, "beyond": 0.4, "thin": 0.05}
 MODEL = Uncertainty(
     tuple(EACH.get(name, 0.0) for name in VARIANCE_TERMS), DepthBands((0.3,) * DEPTHS, (0.04,) * DEPTHS)
 )
-
-
-def moved(*elevations_mm):
-    poses = np.tile(np.eye(4), (len(elevations_mm), 1, 1))
-    poses[:, 1, 3] = elevations_mm
-    return poses
 
 
 @pytest.fixture

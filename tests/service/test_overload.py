@@ -6,12 +6,11 @@ import threading
 import grpc
 import httpx
 import pytest
-import torch
 
-from ultragray import GaussianScene, SceneInfo
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import wait_until
+from ..workers.pool.test_costly_scenes import save_wide
 from .conftest import DEMO_PROBE, make_scene
 from .rpc.test_grpc_render import error_info, moved
 
@@ -25,15 +24,7 @@ def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")
     make_scene(probe=DEMO_PROBE).save(folder / "demo.ugr")
     for name, log_scale in (("wide", 5.0), ("endless", 20.0)):
-        random = torch.Generator().manual_seed(0)
-        splats = {
-            "means": torch.rand(20_000, 3, generator=random) + torch.tensor([0.0, 0.0, 1.0]),
-            "scales": torch.full((20_000, 3), log_scale),
-            "quats": torch.ones(20_000, 4),
-            "transmittances": torch.zeros(20_000),
-            "sh0": torch.zeros(20_000, 1, 1),
-        }
-        GaussianScene.from_splats(splats, info=SceneInfo(probe=DEMO_PROBE)).save(folder / f"{name}.ugr")
+        save_wide(folder, name, count=20_000, log_scale=log_scale)
     return folder
 
 

@@ -2,7 +2,6 @@
 
 from json import dumps, loads
 
-import cv2
 import numpy as np
 import pytest
 from websockets.sync.client import connect
@@ -12,21 +11,14 @@ from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.database import JobDatabase
 
+from ..model.test_registration import motion
 from .conftest import split
 
 SIZE = {"height": 16, "width": 12}
 ROLES = {"alice": Role.OPERATOR, "bob": Role.OPERATOR, "reader": Role.READER}
 
 
-def motion(seed):
-    rng = np.random.default_rng(seed)
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(rng.normal(size=3))[0]
-    pose[:3, 3] = 100.0 * rng.normal(size=3)
-    return pose
-
-
-BASE_TO_SCENE, MOUNTING = motion(0), motion(1)
+BASE_TO_SCENE, MOUNTING = (motion(np.random.default_rng(seed)) for seed in range(2))
 POSE = np.eye(4)
 POSE[1, 3] = 2.0
 FLANGE = np.linalg.inv(BASE_TO_SCENE) @ POSE @ np.linalg.inv(MOUNTING)

@@ -2,7 +2,6 @@
 
 import json
 
-import cv2
 import nibabel
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from ultragray.scene.info import read_header
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
+from ...model.test_registration import motion
 from ...workers.jobs.conftest import store_dataset
 from .command_line import noise_sweep, refused, run, succeeded
 
@@ -241,13 +241,6 @@ def test_mistakes_of_localize_are_told_in_one_line(tmp_path):
     np.save(tmp_path / "bytes.npy", np.full((64, 64), 200.0))
     told = refused("localize", DEMO_FILE, tmp_path / "bytes.npy", "--start", start)
     assert "in [0, 1], or uint8, got float64 from 200 to 200" in told
-
-
-def motion(rng):
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(rng.normal(size=3))[0]
-    pose[:3, 3] = 100.0 * rng.normal(size=3)
-    return pose
 
 
 def test_points_are_registered_and_residuals_told(tmp_path):
