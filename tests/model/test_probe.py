@@ -12,7 +12,7 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe,
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidProbe
 from ultragray.exchange.released_config import stretch_released_far
-from ultragray.geometry.scan_conversion import samples, scan_convert, scan_convert_labels
+from ultragray.geometry.scan_conversion import samples, scan_convert
 
 PROBES = [
     *(member(**member.example()) for member in Probe.members.values()),
@@ -193,20 +193,6 @@ def test_a_phased_frame_is_drawn_from_its_apex_on():
     assert picture[60, 85] == 1.0
     angle = np.degrees(np.arctan2(np.arange(170) + 0.5 - 85, 30.5))
     np.testing.assert_array_equal(picture[30] > 0, np.abs(angle) <= 45)
-
-
-def test_labels_are_drawn_without_mixing_them():
-    labels = np.zeros((40, 40), np.uint8)
-    labels[:, 20:] = 200
-    labels[20:, :20] = 7
-    for probe in (CONVEX, PHASED):
-        picture = scan_convert_labels(labels, probe, pixel_mm=0.7)
-        assert picture.dtype == np.uint8
-        assert set(np.unique(picture)) == {0, 7, 200}
-        drawn = scan_convert(labels == 200, probe, pixel_mm=0.7)
-        assert picture.shape == drawn.shape
-        np.testing.assert_array_equal(picture[drawn == 1.0], 200)
-        np.testing.assert_array_equal(picture[drawn == 0.0] == 200, False)
 
 
 @pytest.mark.parametrize("probe", [CONVEX, PHASED, LinearProbe(40.0, 0.0, 50.0)])

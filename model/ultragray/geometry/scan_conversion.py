@@ -50,13 +50,6 @@ def _pixels(probe: Probe, shape: tuple[int, int], pixel_mm: float) -> tuple[npt.
     return inside, i * width + j, below, beside, down, right
 
 
-def scan_convert_labels(labels: ByteImage, probe: Probe, pixel_mm: float) -> ByteImage:  # [H, W] -> [H', W']
-    """The same of labels, which are not mixed: each pixel has that of the nearest sample."""
-    rows, columns, inside = samples(probe, labels.shape, pixel_mm)
-    nearest = labels[np.rint(rows).astype(np.intp), np.rint(columns).astype(np.intp) % labels.shape[1]]
-    return np.where(inside, nearest, 0).astype(np.uint8)
-
-
 def with_square_pixels(frame: FloatImage, probe: Probe, longer_side: int) -> FloatImage:  # [H, W] -> [H', W']
     """A frame as a picture whose longer side has `longer_side` pixels."""
     return scan_convert(frame, probe, probe.box_mm.longer_side / longer_side * _NOT_ONE_MORE)

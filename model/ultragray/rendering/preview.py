@@ -92,10 +92,6 @@ class Previewer:
         self._squares, self._products = np.zeros((2, 2, _KNOTS))
         self._missed, self._missed_late = np.zeros((2, _KNOTS))
 
-    @property
-    def is_empty(self) -> bool:
-        return not self._pairs
-
     def observe(self, real: Grey, rendered: Grey, pose: FloatArray) -> None:
         """Takes a real frame and the scene's at its pose [4, 4], mm."""
         new = _Pair(real, rendered, pose)
