@@ -15,7 +15,6 @@ import numpy.typing as npt
 from ultragray.geometry.probe import FloatArray, Probe
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
-ByteImage: TypeAlias = npt.NDArray[np.uint8]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Interpolate: TypeAlias = Callable[[npt.NDArray[Any], int, FloatArray, FloatArray], FloatArray]
