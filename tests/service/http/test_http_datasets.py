@@ -22,7 +22,6 @@ from ...warm import Hold
 
 KEY = "0123456789abcdef-datasets"
 OTHER_KEYS = (f"{KEY}-2", f"{KEY}-3")
-KEY_HEADER = {"X-API-Key": KEY}
 LIMIT_BYTES = 200_000
 ZIP = "application/zip"
 WAIT_S = 300.0
