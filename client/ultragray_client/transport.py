@@ -13,6 +13,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractContextManager, aclosing
 from dataclasses import dataclass, is_dataclass
+from functools import cache
 from types import MappingProxyType, MethodType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
@@ -270,6 +271,7 @@ def _reading(read: Callable[[Any], T] | type[T]) -> Callable[[Any], T]:
     return lambda message: from_message(message, cls)
 
 
+@cache
 def _described(method: str) -> MethodDescriptor:
     """The descriptor of a method such as "SceneService.GetScene"."""
     return Default().FindMethodByName(f"ultragray.v1.{method}")
