@@ -42,7 +42,7 @@ from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import LinearProbe
 from ultragray.learn.editing.editor import edit_scene
 from ultragray.learn.evaluation.baselines import compound
-from ultragray.learn.motion import chest_motion, with_motion
+from ultragray.learn.motion import add_motion
 from ultragray.learn.registration import register_frames
 from ultragray.learn.training.agreement import agreed_path
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
@@ -59,6 +59,7 @@ from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray.samplers import AroundSampler
 from ultragray.scene.confidence import Assessor, supported
 from ultragray.scene.edits import InsertEdit
+from ultragray.scene.modes import MotionSettings
 from ultragray.scene.shapes import SphereShape, TubeShape
 from ultragray_studies.gym import UltragrayEnv
 from ultragray_studies.hand import Errors, HandSweep
@@ -337,7 +338,7 @@ def draw_abdomen(path: Path) -> None:
 
 def draw_motion(scene: GaussianScene, path: Path) -> None:
     """The built-in chest: deep tissue goes from the skin as it breathes."""
-    moving = with_motion(scene, *chest_motion(scene.info, 8.0))
+    moving = add_motion(scene, MotionSettings(chest_mm=8.0)).scene
     figure, panels = panel_row(rows=1, columns=3)
     phases = {"at rest": 0.0, "half a breath": 0.5, "full breath": 1.0}
     for panel, (title, number) in zip(panels, phases.items(), strict=True):

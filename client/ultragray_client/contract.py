@@ -51,6 +51,8 @@ __all__ = [
     "MergeEdit",
     "MeshShape",
     "Motion",
+    "MotionJob",
+    "MotionSettings",
     "MoveEdit",
     "Needle",
     "PhasedProbe",
@@ -632,6 +634,109 @@ class LiveJob:
 
 
 @dataclass(frozen=True)
+class SphereShape:
+    """A ball."""
+
+    centre_mm: tuple[float, float, float]  # Its middle.
+    radius_mm: float  # Its radius.
+    kind: Literal["sphere"] = field_of(default="sphere", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class EllipsoidShape:
+    """An ellipsoid; its distance is exact to first order."""
+
+    centre_mm: tuple[float, float, float]  # Its middle.
+    radii_mm: tuple[float, float, float]  # Half its axes.
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Axis times angle, degrees, about the axes of the scene.
+    kind: Literal["ellipsoid"] = field_of(default="ellipsoid", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class BoxShape:
+    """A box along the axes of the scene."""
+
+    min_mm: tuple[float, float, float]  # Its least corner.
+    max_mm: tuple[float, float, float]  # Its greatest corner.
+    kind: Literal["box"] = field_of(default="box", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class TubeShape:
+    """All that lies near a path of straight pieces, such as a vessel."""
+
+    points_mm: tuple[tuple[float, float, float], ...]  # The path, two points or more.
+    radius_mm: float  # Its radius.
+    kind: Literal["tube"] = field_of(default="tube", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class MeshShape:
+    """The inside of a closed surface of triangles."""
+
+    data: str  # A file of the mesh in base64, in mm of the scene's frame.
+    format: str = "stl"  # Of the file.
+    kind: Literal["mesh"] = field_of(default="mesh", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class MapShape:
+    """The voxels of a label in a label map. It can be cut out and relabelled, not inserted."""
+
+    data: str  # A NIfTI-1 or NRRD file in base64, in mm of the scene's frame (RAS+).
+    format: str = "nii.gz"  # Of the file.
+    label: int = 0  # Of the voxels; 0: of all that have one.
+    kind: Literal["map"] = field_of(default="map", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class LabelShape:
+    """The Gaussians of the scene that have a label. It can be cut out and relabelled, not inserted."""
+
+    name: str  # Of the label, as the scene names it.
+    kind: Literal["label"] = field_of(default="label", repr=False, kw_only=True)
+
+
+Shape: TypeAlias = SphereShape | EllipsoidShape | BoxShape | TubeShape | MeshShape | MapShape | LabelShape
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSettings:
+    """A mode of motion that a scene is to get beside those that it has: learned from frames, or built in."""
+
+    name: str | None = None  # Of the mode. Default: breathing; of a vessel: pulse.
+    chest_mm: float | None = None  # Built in: deep tissue goes so far from the skin and back.
+    pulse_mm: float | None = None  # Built in: the wall of a vessel goes so far out, and tissue about it makes room.
+    vessel: Shape | None = None  # The vessel that pulsates: a tube, or a label of the scene.
+    steps: int = 3000  # Of the fit to frames.
+    # Between splines of the field. Default: 15; of a field that is given 6; of a vessel half its radius, or what
+    # there is room for.
+    spacing_mm: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionJob(MotionSettings):
+    """A scene gets a mode of motion: learned from the frames of a dataset, or built in.
+
+    The scene itself stays as it is; the one that moves is served when the job has succeeded.
+    """
+
+    kind: Literal["motion"] = field_of(default="motion", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
+    max_run_s: float | None = None
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
+    device: str = "auto"
+    min_memory_gb: int | None = None  # Least memory of the device, 10^9 bytes; of cpu: of the host.
+    # Labels that the worker must have, such as {"site": "lab1"}.
+    worker_labels: dict[str, str] = field_of(default_factory=dict)
+    scene: str  # Name of the scene, which was trained as if its tissue were still.
+    into: str  # Name that the scene that moves will be served under.
+    dataset: str | None = None  # Name of the dataset that the mode is learned from.
+    # One for each frame of the recording, such as a belt's reading. Default: they are found in the frames.
+    numbers: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
 class AroundSampler:
     """`count` of the base poses, drawn at random with repetition, each turned and shifted at random.
 
@@ -781,7 +886,7 @@ class VoxelizeJob:
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
 
 
-Specification: TypeAlias = CompareJob | EvaluateJob | LiveJob | RenderJob | TrainJob | VoxelizeJob
+Specification: TypeAlias = CompareJob | EvaluateJob | LiveJob | MotionJob | RenderJob | TrainJob | VoxelizeJob
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -791,73 +896,6 @@ class Motion:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Along the axes of the scene.
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Axis times angle, degrees, about the axes of the scene.
     about_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # The point that the turn leaves where it is.
-
-
-@dataclass(frozen=True)
-class SphereShape:
-    """A ball."""
-
-    centre_mm: tuple[float, float, float]  # Its middle.
-    radius_mm: float  # Its radius.
-    kind: Literal["sphere"] = field_of(default="sphere", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class EllipsoidShape:
-    """An ellipsoid; its distance is exact to first order."""
-
-    centre_mm: tuple[float, float, float]  # Its middle.
-    radii_mm: tuple[float, float, float]  # Half its axes.
-    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Axis times angle, degrees, about the axes of the scene.
-    kind: Literal["ellipsoid"] = field_of(default="ellipsoid", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class BoxShape:
-    """A box along the axes of the scene."""
-
-    min_mm: tuple[float, float, float]  # Its least corner.
-    max_mm: tuple[float, float, float]  # Its greatest corner.
-    kind: Literal["box"] = field_of(default="box", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class TubeShape:
-    """All that lies near a path of straight pieces, such as a vessel."""
-
-    points_mm: tuple[tuple[float, float, float], ...]  # The path, two points or more.
-    radius_mm: float  # Its radius.
-    kind: Literal["tube"] = field_of(default="tube", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class MeshShape:
-    """The inside of a closed surface of triangles."""
-
-    data: str  # A file of the mesh in base64, in mm of the scene's frame.
-    format: str = "stl"  # Of the file.
-    kind: Literal["mesh"] = field_of(default="mesh", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class MapShape:
-    """The voxels of a label in a label map. It can be cut out and relabelled, not inserted."""
-
-    data: str  # A NIfTI-1 or NRRD file in base64, in mm of the scene's frame (RAS+).
-    format: str = "nii.gz"  # Of the file.
-    label: int = 0  # Of the voxels; 0: of all that have one.
-    kind: Literal["map"] = field_of(default="map", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class LabelShape:
-    """The Gaussians of the scene that have a label. It can be cut out and relabelled, not inserted."""
-
-    name: str  # Of the label, as the scene names it.
-    kind: Literal["label"] = field_of(default="label", repr=False, kw_only=True)
-
-
-Shape: TypeAlias = SphereShape | EllipsoidShape | BoxShape | TubeShape | MeshShape | MapShape | LabelShape
 
 
 @dataclass(frozen=True, kw_only=True)

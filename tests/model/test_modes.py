@@ -41,6 +41,12 @@ def test_modes_come_back_from_the_file(moving_scene, tmp_path, suffix):
     np.testing.assert_array_equal(loaded.moving.coefficients, moving_scene.moving.coefficients)
 
 
+def test_a_file_with_modes_has_the_same_bytes_every_time(moving_scene, tmp_path):
+    assert len({moving_scene.to_bytes() for _ in range(16)}) == 1
+    moving_scene.save(tmp_path / "scene.ugr")
+    assert GaussianScene.load(tmp_path / "scene.ugr").to_bytes() == moving_scene.to_bytes()
+
+
 def test_the_description_that_other_readers_know_is_that_of_a_still_scene(moving_scene):
     still = GaussianScene.from_splats(
         moving_scene.splats, info=SceneInfo(probe=PROBE), training_poses=moving_scene.training_poses

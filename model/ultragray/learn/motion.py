@@ -1,53 +1,129 @@
-"""Where modes of motion come from: a sweep of which each frame has a number, or a chest that is built in.
+"""Where modes of motion come from: a sweep, whose frames have a number each or not, or a field that is given.
 
 `fit_motion` begins with a scene that was trained as if its tissue were still, a blur of all phases, and learns the
 field of one mode together with the Gaussians: the frame of a pose and a number is the scene at that phase. The field
-costs what it bends, so that it is smooth where frames say nothing. `chest_motion` needs no frames.
+costs what it bends, so that it is smooth where frames say nothing. `add_motion` does all of it, by the settings of a
+mode.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ultragray.contract import to_dict
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.learn.motion_fields import (
+    Field,
+    Grid,
+    Residual,
+    chest,
+    pulsation,
+    pulsation_spacing_mm,
+    vessel_of,
+    with_mode,
+    with_splines,
+)
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.losses import image_loss
 from ultragray.rendering.frames import render
-from ultragray.scene.deformation import LEAST_SIDE, Displacement, spline_coefficients
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
-from ultragray.scene.info import SceneInfo, with_summary
-from ultragray.scene.modes import FIT_STEPS, MAX_SIDE, Mode, Motion, Moving
+from ultragray.scene.modes import FIT_STEPS, GIVEN_SPACING_MM, SPACING_MM, Mode, MotionSettings
+from ultragray.scene.shapes import LabelShape, TubeShape
 
 Numbers = npt.NDArray[np.float64]
+Report = Callable[[int, float], None]  # of the steps done and the loss
 
-SPACING_MM, CHEST_SPACING_MM = 15.0, 6.0  # between splines: of a field that is learned, of the chest
 BATCH = 4
 RATES = {"means": 1e-2, "scales": 1e-2, "quats": 1e-2, "transmittances": 1e-2, "sh0": 2e-2, "shN": 1e-4}
 FIELD_RATE_MM = 0.25  # a step, of the displacement from end to end
 BENDING = 1e-3  # price of a squared second difference of the field, 1/mm²
 TEXTURE = 0.5  # share of 1 − SSIM in the loss
+LEVEL_RATE = 0.1  # a step, of numbers that are to be found
+STEADY = 1e-3  # price of their squared second difference in time
+FIRST, BEGIN_MM = 0.15, 3.0  # share of the steps that look for numbers alone, and the field that they do it by
 
 
-def read_numbers(path: str | Path, count: int) -> Numbers:  # [F]
-    """A number a line, one for each of at least `count` frames of a recording. Raises DatasetInvalid."""
+class Added(NamedTuple):
+    """A scene with a mode more, and how that was found."""
+
+    scene: GaussianScene
+    residual: Residual | None = None  # of a field that was given
+    numbers: Numbers | None = None  # [F] of the frames, where they were to be found
+    tube: TubeShape | None = None  # of a vessel
+
+    def facts(self) -> dict[str, Any]:
+        """All but the scene, as JSON has it."""
+        assert self.scene.info.motion is not None
+        modes, residual = self.scene.info.motion.modes, self.residual
+        return {
+            "modes": to_dict(modes),
+            "residual_mm": None if residual is None else {"rms": residual.rms_mm, "most": residual.most_mm},
+            "vessel": None if self.tube is None else to_dict(self.tube),
+            "numbers": None if self.numbers is None else self.numbers.tolist(),
+        }
+
+
+def add_motion(
+    scene: GaussianScene,
+    asked: MotionSettings,
+    *,
+    sweep: Sweep | None = None,
+    numbers: Numbers | None = None,  # [F] of its frames; None: they are found
+    surrogate: str = "",
+    field: Field | None = None,
+    report: Report = lambda step, loss: None,
+) -> Added:
+    """The scene with one mode more: of the sweep, of a field, or built in. Raises InvalidArgument."""
+    asked.check_source(sweep=sweep is not None, field=field is not None)
+    name = asked.mode_name(scene.info.motion)
+    if sweep is not None:
+        spacing_mm = asked.spacing_mm or SPACING_MM
+        options: Any = {"name": name, "steps": asked.steps, "spacing_mm": spacing_mm, "report": report}
+        if numbers is None:
+            moving, found = find_motion(scene, sweep, **options)
+            return Added(moving, numbers=found)
+        return Added(fit_motion(scene, sweep, numbers, surrogate=surrogate, **options))
+    tube, spacing_mm = None, asked.spacing_mm or GIVEN_SPACING_MM
+    if asked.chest_mm is not None:
+        field = chest(scene.info, asked.chest_mm)
+    elif asked.pulse_mm is not None:
+        vessel = asked.vessel
+        assert isinstance(vessel, (LabelShape, TubeShape))
+        tube = vessel if isinstance(vessel, TubeShape) else vessel_of(scene, vessel)
+        spacing_mm = asked.spacing_mm or pulsation_spacing_mm(scene, tube)
+        field = pulsation(tube, asked.pulse_mm)
+    assert field is not None
+    return Added(*with_mode(scene, Mode(name, 0.0, 1.0), field, spacing_mm), tube=tube)
+
+
+def read_numbers(path: str | Path, sweep: Sweep) -> Numbers:  # [F]
+    """The numbers of a sweep's frames from a file with one a line, one for each of the recording's.
+
+    Raises DatasetInvalid.
+    """
     try:
         numbers = np.loadtxt(path, dtype=np.float64, ndmin=1, delimiter=",")
     except (OSError, ValueError) as error:
         raise DatasetInvalid(f"{path}: {error}") from error
-    if numbers.ndim != 1 or len(numbers) < count or not np.isfinite(numbers).all():
+    return numbers_of(sweep, numbers, str(path))
+
+
+def numbers_of(sweep: Sweep, numbers: npt.ArrayLike, source: str) -> Numbers:  # [R] of the recording -> [F]
+    """Those of a sweep's frames, which may be a part of the recording's. Raises DatasetInvalid."""
+    given, count = np.asarray(numbers, np.float64), int(sweep.frame_numbers.max()) + 1
+    if given.ndim != 1 or len(given) < count or not np.isfinite(given).all():
         raise DatasetInvalid(
-            f"{path}: it must hold one finite number a line for each of {count} frames, got {list(numbers.shape)}"
+            f"{source}: there must be one finite number for each of {count} frames, got {list(given.shape)}"
         )
-    return numbers
+    return given[sweep.frame_numbers]
 
 
 def fit_motion(
@@ -59,9 +135,9 @@ def fit_motion(
     surrogate: str = "",
     steps: int = FIT_STEPS,
     spacing_mm: float = SPACING_MM,
-    report: Callable[[int, float], None] = lambda step, loss: None,
+    report: Report = lambda step, loss: None,
 ) -> GaussianScene:
-    """The scene with one mode of motion, at rest at the median number.
+    """The scene with one mode of motion more, at rest at the median number; modes that it has are at rest.
 
     Raises InvalidArgument where all numbers are the same.
     """
@@ -73,76 +149,108 @@ def fit_motion(
             field="surrogate",
         )
     mode = Mode(name, low, high, float(np.median(numbers)), surrogate=surrogate)
-    origin, sides = _grid(scene.info, spacing_mm)
-    field = torch.zeros((1, *sides, 3), requires_grad=True)  # mm from end to end
-    splats: dict[str, Any] = {key: tensor.detach().clone().requires_grad_() for key, tensor in scene.splats.items()}
-    rates = [
-        *({"params": [splats[key]], "lr": RATES[key]} for key in PARAMETERS),
-        {"params": [field], "lr": FIELD_RATE_MM},
-    ]
-    optimizer = torch.optim.Adam(rates)
-    decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.05 ** (step / steps))
-    generator = torch.Generator().manual_seed(0)
-    trained = GaussianScene(**splats, info=scene.info)
-    truth = torch.from_numpy(sweep.images)
+    shares = torch.from_numpy(((numbers - mode.rest) / mode.span).astype(np.float32))
+    fit = _Fit(scene, sweep, Grid.over(scene.info, spacing_mm))
     for step in range(steps):
-        batch = torch.randperm(len(sweep), generator=generator)[:BATCH].numpy()
-        shares = torch.from_numpy(((numbers[batch] - mode.rest) / mode.span).astype(np.float32))
-        moved = Displacement.on_grid(shares[:, None, None, None, None] * field, origin, spacing_mm)
+        report(step + 1, fit.step(step / steps, shares))
+    return fit.scene_with(mode, fit.field.detach() / mode.span)
+
+
+def find_motion(
+    scene: GaussianScene,
+    sweep: Sweep,
+    *,
+    name: str = "breathing",
+    steps: int = FIT_STEPS,
+    spacing_mm: float = SPACING_MM,
+    report: Report = lambda step, loss: None,
+) -> tuple[GaussianScene, Numbers]:  # [F] from 0 to 1
+    """As `fit_motion`, where nothing told the numbers of the frames: they are found, by how frames disagree with the
+    still scene where poses agree, and greater ones have tissue farther along the beams.
+
+    Field and numbers enter as a product, of which neither can begin at 0: deep tissue is taken to move along the beams
+    until numbers have been found for that (FIRST); from then on all is learned together. Frames that follow each other
+    have numbers alike (STEADY).
+    """
+    fit = _Fit(scene, sweep, Grid.over(scene.info, spacing_mm))
+    beams = torch.from_numpy(sweep.poses[:, :3, 2].mean(axis=0)).float()
+    fit.begin_with(beams)
+    levels = torch.zeros(len(sweep), requires_grad=True)
+    optimizer = torch.optim.Adam([levels], lr=LEVEL_RATE)
+    in_time = torch.from_numpy(np.argsort(sweep.frame_numbers, kind="stable"))
+    for step in range(steps):
+        done = step / steps
+        optimizer.zero_grad()
+        (STEADY * levels[in_time].diff(n=2).square().mean()).backward()  # type: ignore[no-untyped-call]
+        loss = fit.step(done, levels, only_shares=done < FIRST)
+        optimizer.param_groups[0]["lr"] = LEVEL_RATE * 0.05**done
+        optimizer.step()
+        report(step + 1, loss)
+    found, field = levels.detach().double().numpy(), fit.field.detach()
+    if float((field @ beams).mean()) < 0.0:
+        found, field = -found, -field
+    low, span = found.min(), np.ptp(found)
+    if not span > 0.0:
+        raise InvalidArgument("the frames tell of no motion: their numbers are all the same", field="surrogate")
+    mode = Mode(name, 0.0, 1.0, float(-low / span), surrogate="found in the frames")
+    return fit.scene_with(mode, field * span), (found - low) / span
+
+
+class _Fit:
+    """Gaussians and a field of one mode, learned together."""
+
+    def __init__(self, scene: GaussianScene, sweep: Sweep, grid: Grid) -> None:
+        self._scene, self._sweep, self._grid = scene, sweep, grid
+        self.field = torch.zeros((1, *grid.sides, 3), requires_grad=True)  # mm, of a share of 1
+        self._splats: dict[str, Any] = {
+            key: tensor.detach().clone().requires_grad_() for key, tensor in scene.splats.items()
+        }
+        self._trained = GaussianScene(**self._splats, info=scene.info)
+        rates = [
+            *({"params": [self._splats[key]], "lr": RATES[key]} for key in PARAMETERS),
+            {"params": [self.field], "lr": FIELD_RATE_MM},
+        ]
+        self._optimizer = torch.optim.Adam(rates)
+        self._rates = [group["lr"] for group in self._optimizer.param_groups]
+        self._generator = torch.Generator().manual_seed(0)
+        self._truth = torch.from_numpy(sweep.images)
+
+    def begin_with(self, beams: Tensor) -> None:  # [3]
+        """A field by which tissue moves along the beams, by up to BEGIN_MM where it is deep."""
+        nodes = [
+            torch.arange(side) * spacing for side, spacing in zip(self._grid.sides, self._grid.spacing_mm, strict=True)
+        ]
+        depth = torch.stack(torch.meshgrid(*nodes, indexing="ij"), dim=-1).float() @ beams
+        share = (depth - depth.min()) / (depth.max() - depth.min())
+        self.field.data = (BEGIN_MM * share[..., None] * beams)[None]
+
+    def step(self, done: float, shares: Tensor, *, only_shares: bool = False) -> float:  # [F] -> loss
+        """One step of a batch, when a share of all steps is done; gradients reach the frames' shares of the field."""
+        sweep = self._sweep
+        batch = torch.randperm(len(sweep), generator=self._generator)[:BATCH].numpy()
+        moved = self._grid.displacement(shares[batch, None, None, None, None] * self.field)
         frames = render(
-            trained.under(moved),
+            self._trained.under(moved),
             sweep.probe,
             sweep.poses[batch],
             height=sweep.height,
             width=sweep.width,
             outputs=("bmode",),
         )
-        loss = image_loss(frames["bmode"], truth[batch].float() / 255.0, TEXTURE) + BENDING * _bending(field)
-        optimizer.zero_grad()
+        truth = self._truth[batch].float() / 255.0
+        loss = image_loss(frames["bmode"], truth, TEXTURE) + BENDING * _bending(self.field)
+        for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * 0.05**done
+        self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        decay.step()
-        report(step + 1, float(loss.detach()))
-    coefficients = (field.detach() / mode.span).numpy()
-    learned: dict[str, Any] = {key: tensor.detach() for key, tensor in splats.items()}
-    motion = Motion((mode,), tuple(origin.tolist()), (spacing_mm,) * 3)
-    return with_motion(replace(scene, **learned), motion, coefficients)
+        if not only_shares:
+            self._optimizer.step()
+        return float(loss.detach())
 
-
-def chest_motion(info: SceneInfo, depth_mm: float, *, spacing_mm: float = CHEST_SPACING_MM) -> tuple[Motion, Any]:
-    """A chest or belly that breathes by `depth_mm` along the scene's z as its number goes from 0 to 1.
-
-    Deep tissue moves as a whole, away from the skin under the probe, which stays: the motion rises over the first third
-    of the scene's depth, where tissue is drawn apart.
-    """
-    origin, sides = _grid(info, spacing_mm)
-    low, high = info.bounds_min_mm[2], info.bounds_max_mm[2]
-    nodes = origin[2] + spacing_mm * np.arange(1, sides[2] - 1)  # through which the splines go
-    share = np.clip((nodes - low) / max((high - low) / 3.0, spacing_mm), 0.0, 1.0)
-    samples = torch.zeros((1, *(side - 2 for side in sides), 3), dtype=torch.float64)
-    samples[..., 2] = torch.from_numpy(depth_mm * (1.0 - np.cos(math.pi * share)) / 2.0)
-    motion = Motion((Mode("breathing", 0.0, 1.0),), tuple(origin.tolist()), (spacing_mm,) * 3)
-    return motion, spline_coefficients(samples)
-
-
-def with_motion(scene: GaussianScene, motion: Motion, coefficients: Any) -> GaussianScene:
-    """The scene with these modes instead of its own; [M, X, Y, Z, 3] mm."""
-    moving = Moving(motion, np.ascontiguousarray(coefficients, np.float32))
-    info = with_summary(scene.info, scene.means.detach().double().numpy(), scene.sh_degree)
-    return replace(scene, info=replace(info, motion=motion), moving=moving)
-
-
-def _grid(info: SceneInfo, spacing_mm: float) -> tuple[npt.NDArray[np.float64], tuple[int, ...]]:
-    """The first spline (mm) and the sides of a grid that holds the Gaussians, with a spline beyond at each end."""
-    low, high = np.asarray(info.bounds_min_mm), np.asarray(info.bounds_max_mm)
-    sides = np.maximum(np.ceil((high - low) / spacing_mm).astype(int) + 3, LEAST_SIDE)
-    if sides.max() > MAX_SIDE:
-        raise InvalidArgument(
-            f"spacing_mm must be at least {(high - low).max() / (MAX_SIDE - 3):.1f} for a scene of this size, got "
-            f"{spacing_mm:g}",
-            field="spacing_mm",
-        )
-    return (low + high - spacing_mm * (sides - 1)) / 2.0, tuple(sides.tolist())
+    def scene_with(self, mode: Mode, field: Tensor) -> GaussianScene:  # [1, X, Y, Z, 3] mm for one unit
+        """What was learned, as a scene with one mode more."""
+        learned: dict[str, Any] = {key: tensor.detach() for key, tensor in self._splats.items()}
+        return with_splines(replace(self._scene, **learned), mode, self._grid, field[0])
 
 
 def _bending(field: Tensor) -> Tensor:  # [1, X, Y, Z, 3] -> scalar

@@ -124,15 +124,29 @@ def displaced(means: Tensor, displacements: Sequence[Displacement], pose: int) -
 
 def spline_coefficients(samples: Tensor) -> Tensor:  # [..., X, Y, Z, 3] -> [..., X + 2, Y + 2, Z + 2, 3]
     """Of the cubic splines through samples at grid coordinates 1, 2, …, which do not bend at the ends."""
-    for axis in (-4, -3, -2):
-        count = samples.shape[axis]
+    inverses = []
+    for count in samples.shape[-4:-1]:
         equations = torch.zeros((count + 2, count + 2), dtype=torch.float64)
         for row in range(count):
             equations[row + 1, row : row + 3] = torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) / 6.0
         equations[0, :3] = equations[-1, -3:] = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64)
-        inverse = torch.linalg.inv(equations)[:, 1:-1].to(samples)
-        samples = torch.tensordot(samples.movedim(axis, -1), inverse, dims=([-1], [1])).movedim(-1, axis)
-    return samples
+        inverses.append(torch.linalg.inv(equations)[:, 1:-1])
+    return along_axes(samples, inverses)
+
+
+def along_axes(values: Tensor, matrices: Sequence[Tensor]) -> Tensor:  # [..., X, Y, Z, 3] -> [..., X', Y', Z', 3]
+    """The values multiplied by a matrix along each axis of a grid: [X', X], [Y', Y], [Z', Z]."""
+    for axis, matrix in zip((-4, -3, -2), matrices, strict=True):
+        values = torch.tensordot(values.movedim(axis, -1), matrix.to(values), dims=([-1], [1])).movedim(-1, axis)
+    return values
+
+
+def spline_basis(places: Tensor, count: int) -> Tensor:  # [S] grid coordinates from 1 to count - 2 -> [S, count]
+    """What each of the splines of an axis is at some places."""
+    cell = places.floor().clamp(max=count - 3)
+    values, _ = _splines(places - cell)
+    basis = places.new_zeros((len(places), count))
+    return basis.scatter_(1, cell.long()[:, None] - 1 + torch.arange(4), values)
 
 
 def _splines(t: Tensor) -> tuple[Tensor, Tensor]:  # [...] in [0, 1] -> [..., 4] both

@@ -45,6 +45,7 @@ from ultragray.scene.info import (
     read_gaussians,
     read_header,
     scene_file_invalid,
+    with_metadata_in_order,
     with_summary,
 )
 from ultragray.scene.modes import MOTION_KEY, Moving
@@ -320,7 +321,7 @@ class GaussianScene:
         motion = {} if self.moving is None else {MOTION_KEY: self.moving.to_json()}
         data: bytes = save(tensors, metadata={METADATA_KEY: description, **motion})
         check_header_size(data)
-        return data
+        return with_metadata_in_order(data) if motion else data
 
     def save(self, path: str | Path) -> None:
         """Writes the scene file, a compressed one where the path ends in .ugz, whole or not at all.

@@ -234,6 +234,16 @@ def read_header(path: str | Path) -> SceneHeader:
     return SceneHeader(info, poses, size, **beside, moving=moving, is_compressed=is_compressed, text_bytes=text_bytes)
 
 
+def with_metadata_in_order(data: bytes) -> bytes:
+    """A bundle with the entries of its metadata by name: safetensors writes several in an order that changes."""
+    end = _LENGTH_BYTES + int.from_bytes(data[:_LENGTH_BYTES], "little")
+    header = json.loads(data[_LENGTH_BYTES:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % _LENGTH_BYTES)  # tensors begin at a multiple of 8 bytes
+    return len(text).to_bytes(_LENGTH_BYTES, "little") + text + data[end:]
+
+
 def read_gaussians(path: str | Path, info: SceneInfo) -> dict[str, npt.NDArray[Any]]:
     """The raw parameters [N, ...] of a scene file of this description and, where it names some, its labels [N].
 

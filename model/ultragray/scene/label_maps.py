@@ -1,4 +1,5 @@
-"""Labels in files: label maps in NIfTI-1, read by nibabel (extra `nifti`), and NRRD, and painted frames. Free of torch.
+"""Labels in files: label maps in NIfTI-1, read by nibabel (extra `nifti`), and NRRD, and painted frames; and fields of
+displacements in the same formats. Free of torch.
 
 The reader of NRRD is ours, as that of sequences is (`ultragray.datasets.plus_files`): pynrrd inflates whatever a header
 promises.
@@ -6,12 +7,13 @@ promises.
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -66,12 +68,54 @@ def read_label_map(path: str | Path) -> LabelMap:
 
 def read_volume(path: str | Path, *, field: str) -> tuple[npt.NDArray[Any], FloatArray]:  # [I, J, K], [4, 4]
     """The values of a NIfTI or NRRD file, and the way from its voxels to mm, RAS+. Raises as `read_label_map`."""
+    values, affine, _ = _read(path, field, vectors=False)
+    return values, affine
+
+
+class VectorField(NamedTuple):
+    """Displacements at the voxels of a volume, both in mm of the file's own frame, RAS+."""
+
+    vectors: FloatArray  # [I, J, K, 3]
+    affine: FloatArray  # [4, 4] voxels to mm
+
+
+VECTOR_AXES = ("ras", "lps")
+_INTENT_DISPLACEMENT = 1006  # of NIfTI-1: vectors that are in the axes of its coordinates, RAS+
+
+
+def read_vector_field(path: str | Path, axes: str | None = None, *, field: str = "field") -> VectorField:
+    """The displacements of a NIfTI file [I, J, K, 3] or [I, J, K, 1, 3], or of an NRRD file.
+
+    `axes`, of VECTOR_AXES: of the numbers of a vector. NRRD says it, and NIfTI whose intent is a displacement; ITK and
+    ANTs write NIfTI of the intent "vector", in LPS, which does not: there it must be given. Raises as `read_label_map`,
+    and InvalidArgument where the axes are not known, or given otherwise than the file says.
+    """
+    values, affine, said = _read(path, field, vectors=True)
+    if axes is None and said is None:
+        raise InvalidArgument(
+            f"{Path(path).name} does not say in which axes its vectors are: {' or '.join(VECTOR_AXES)} must be given "
+            "(ITK, ANTs and Slicer write lps)",
+            field="field_axes",
+        )
+    to_ras = _TO_RAS[axes or said or ""]
+    if said is not None and _TO_RAS[said] != to_ras:
+        raise InvalidArgument(f"{Path(path).name} says that its vectors are {said}, not {axes}", field="field_axes")
+    vectors: FloatArray = values.astype(np.float64) * to_ras
+    if not np.isfinite(vectors).all():
+        raise InvalidArgument(f"{Path(path).name} must hold finite numbers", field=field)
+    return VectorField(vectors, affine)
+
+
+_Read: TypeAlias = tuple[npt.NDArray[Any], FloatArray, str | None]  # values, voxels to mm (RAS+), axes of the vectors
+
+
+def _read(path: str | Path, field: str, *, vectors: bool) -> _Read:
     path = Path(path)
     if not path.name.endswith(LABEL_MAP_SUFFIXES):
         *most, last = LABEL_MAP_SUFFIXES
         raise InvalidArgument(f"{field} must end in {', '.join(most)} or {last}, got {path.name!r}", field=field)
     try:
-        return _read_nrrd(path, field) if path.name.endswith(".nrrd") else _read_nifti(path, field)
+        return (_read_nrrd if path.name.endswith(".nrrd") else _read_nifti)(path, field, vectors)
     except (InvalidArgument, ExtraMissing):
         raise
     except Exception as error:  # nibabel raises whatever the reading of a damaged file meets
@@ -80,25 +124,25 @@ def read_volume(path: str | Path, *, field: str) -> tuple[npt.NDArray[Any], Floa
         raise InvalidArgument(f"{path.name} cannot be read as {kind}: {reason}", field=field) from None
 
 
-def _read_nifti(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
+def _read_nifti(path: Path, field: str, vectors: bool) -> _Read:
     try:
         import nibabel
     except ImportError as error:
-        raise missing_extra(error, "reading label maps", field=field) from error
+        raise missing_extra(error, "reading NIfTI", field=field) from error
     image: Any = nibabel.load(path)
     shape = tuple(side for place, side in enumerate(image.shape) if place < 3 or side != 1)
-    _check_volume(shape, field)
-    return np.asanyarray(image.dataobj).reshape(shape), np.asarray(image.affine, np.float64)
+    _check_volume(shape, field, vectors)
+    axes = "ras" if int(image.header["intent_code"]) == _INTENT_DISPLACEMENT else None
+    return np.asanyarray(image.dataobj).reshape(shape), np.asarray(image.affine, np.float64), axes
 
 
-def _check_volume(shape: Sequence[int], field: str) -> None:
-    if len(shape) != 3 or not 0 < np.prod(shape, dtype=np.float64) <= MAX_VOXELS:
-        raise InvalidArgument(
-            f"{field} must be a volume of at most {MAX_VOXELS:,} voxels, it is {list(shape)}", field=field
-        )
+def _check_volume(shape: Sequence[int], field: str, vectors: bool) -> None:
+    if len(shape) != 3 + vectors or shape[3:] not in ((), (3,)) or not 0 < math.prod(shape) <= MAX_VOXELS:
+        what = "three numbers a voxel, of" if vectors else "a volume of"
+        raise InvalidArgument(f"{field} must be {what} at most {MAX_VOXELS:,}, it is {list(shape)}", field=field)
 
 
-def _read_nrrd(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
+def _read_nrrd(path: Path, field: str, vectors: bool) -> _Read:
     """Raises ValueError, KeyError, OSError, zlib.error for another file than of one volume, raw or gzip."""
     data = path.read_bytes()
     end = re.search(rb"\r?\n\r?\n", data[:_MAX_NRRD_HEADER_BYTES])
@@ -107,22 +151,30 @@ def _read_nrrd(path: Path, field: str) -> tuple[npt.NDArray[Any], FloatArray]:
     head, body = data[: end.start()].decode("utf-8", errors="replace"), data[end.end() :]
     lines = (line.partition(": ") for line in head.splitlines()[1:])
     fields = {key.lower(): value.strip() for key, colon, value in lines if colon}
-    shape = [int(size) for size in fields["sizes"].split()]
-    _check_volume(shape, field)
+    sizes = [int(size) for size in fields["sizes"].split()]
+    directions = re.findall(r"none|\([^)]*\)", fields["space directions"])
+    last = directions.index("none") if vectors and "none" in directions else len(sizes) - 1  # axis of the vectors
+    _check_volume((*sizes[:last], *sizes[last + 1 :], sizes[last]), field, vectors)
     encoding, dtype = fields["encoding"].lower(), np.dtype(_NRRD_TYPES[fields["type"].lower()])
     if encoding not in ("raw", "gzip", "gz") or "data file" in fields or "datafile" in fields:
         raise ValueError(f"its voxels must be in it, raw or gzip, they are {encoding}")
-    expected = dtype.itemsize * int(np.prod(shape))
+    expected = dtype.itemsize * math.prod(sizes)
     voxels = body if encoding == "raw" else zlib.decompressobj(_ZLIB_OR_GZIP).decompress(body, expected)
     if len(voxels) < expected:
         raise ValueError(f"truncated: it holds {len(voxels)} of {expected} bytes")
     order: Literal["<", ">"] = ">" if fields.get("endian", "little").lower() == "big" else "<"
-    values = np.frombuffer(voxels[:expected], dtype.newbyteorder(order)).reshape(shape, order="F")
-    vectors = re.findall(r"\(([^)]*)\)", f"{fields['space directions']} {fields['space origin']}")
-    affine = np.eye(4)
-    affine[:3] = np.array([[float(value) for value in vector.split(",")] for vector in vectors]).T
-    affine[:3] *= np.array(_TO_RAS[fields["space"].lower()])[:, None]
-    return values, affine
+    values = np.frombuffer(voxels[:expected], dtype.newbyteorder(order)).reshape(sizes, order="F")
+    space, affine = fields["space"].lower(), np.eye(4)
+    affine[:3] = (_vectors_in(f"{fields['space directions']} {fields['space origin']}") * _TO_RAS[space]).T
+    if vectors:
+        values = np.moveaxis(values, last, -1)
+        if "measurement frame" in fields:  # the axes of the vectors, in those of `space`
+            values = values @ _vectors_in(fields["measurement frame"])
+    return values, affine, space
+
+
+def _vectors_in(text: str) -> FloatArray:  # [N, 3]
+    return np.array([[float(value) for value in one.split(",")] for one in re.findall(r"\(([^)]*)\)", text)])
 
 
 PAINTED_SUFFIX = ".npz"

@@ -20,6 +20,7 @@ class JobKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     JOB_KIND_COMPARE: _ClassVar[JobKind]
     JOB_KIND_VOXELIZE: _ClassVar[JobKind]
     JOB_KIND_LIVE: _ClassVar[JobKind]
+    JOB_KIND_MOTION: _ClassVar[JobKind]
 
 class JobState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -36,6 +37,7 @@ JOB_KIND_EVALUATE: JobKind
 JOB_KIND_COMPARE: JobKind
 JOB_KIND_VOXELIZE: JobKind
 JOB_KIND_LIVE: JobKind
+JOB_KIND_MOTION: JobKind
 JOB_STATE_UNSPECIFIED: JobState
 JOB_STATE_QUEUED: JobState
 JOB_STATE_RUNNING: JobState
@@ -123,6 +125,45 @@ class LiveJob(_message.Message):
     scene: str
     version_every_s: float
     def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., recording: _Optional[str] = ..., scene: _Optional[str] = ..., version_every_s: _Optional[float] = ...) -> None: ...
+
+class MotionJob(_message.Message):
+    __slots__ = ("max_run_s", "device", "min_memory_gb", "worker_labels", "name", "chest_mm", "pulse_mm", "vessel", "steps", "spacing_mm", "scene", "into", "dataset", "numbers")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    CHEST_MM_FIELD_NUMBER: _ClassVar[int]
+    PULSE_MM_FIELD_NUMBER: _ClassVar[int]
+    VESSEL_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    SPACING_MM_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    INTO_FIELD_NUMBER: _ClassVar[int]
+    DATASET_FIELD_NUMBER: _ClassVar[int]
+    NUMBERS_FIELD_NUMBER: _ClassVar[int]
+    max_run_s: float
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    name: str
+    chest_mm: float
+    pulse_mm: float
+    vessel: _scenes_pb2.Shape
+    steps: int
+    spacing_mm: float
+    scene: str
+    into: str
+    dataset: str
+    numbers: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., name: _Optional[str] = ..., chest_mm: _Optional[float] = ..., pulse_mm: _Optional[float] = ..., vessel: _Optional[_Union[_scenes_pb2.Shape, _Mapping]] = ..., steps: _Optional[int] = ..., spacing_mm: _Optional[float] = ..., scene: _Optional[str] = ..., into: _Optional[str] = ..., dataset: _Optional[str] = ..., numbers: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class TrainJob(_message.Message):
     __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels", "start_scene")
@@ -268,13 +309,14 @@ class PoseSampler(_message.Message):
     def __init__(self, kind: _Optional[str] = ..., count: _Optional[int] = ..., translation_mm: _Optional[float] = ..., rotation_deg: _Optional[float] = ..., seed: _Optional[int] = ..., spacing_mm: _Optional[float] = ..., tilt_deg: _Optional[float] = ..., step_deg: _Optional[float] = ...) -> None: ...
 
 class SubmitJobRequest(_message.Message):
-    __slots__ = ("train", "render", "evaluate", "compare", "voxelize", "live", "request_id", "priority", "private")
+    __slots__ = ("train", "render", "evaluate", "compare", "voxelize", "live", "motion", "request_id", "priority", "private")
     TRAIN_FIELD_NUMBER: _ClassVar[int]
     RENDER_FIELD_NUMBER: _ClassVar[int]
     EVALUATE_FIELD_NUMBER: _ClassVar[int]
     COMPARE_FIELD_NUMBER: _ClassVar[int]
     VOXELIZE_FIELD_NUMBER: _ClassVar[int]
     LIVE_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     PRIORITY_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
@@ -284,10 +326,11 @@ class SubmitJobRequest(_message.Message):
     compare: CompareJob
     voxelize: VoxelizeJob
     live: LiveJob
+    motion: MotionJob
     request_id: str
     priority: int
     private: bool
-    def __init__(self, train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., live: _Optional[_Union[LiveJob, _Mapping]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., private: _Optional[bool] = ...) -> None: ...
+    def __init__(self, train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., live: _Optional[_Union[LiveJob, _Mapping]] = ..., motion: _Optional[_Union[MotionJob, _Mapping]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class SubmitJobResponse(_message.Message):
     __slots__ = ("job", "created")
@@ -412,7 +455,7 @@ class JobEvent(_message.Message):
     def __init__(self, job: _Optional[_Union[Job, _Mapping]] = ..., log: _Optional[str] = ...) -> None: ...
 
 class Job(_message.Message):
-    __slots__ = ("kind", "train", "render", "evaluate", "compare", "voxelize", "live", "id", "state", "request_id", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
+    __slots__ = ("kind", "train", "render", "evaluate", "compare", "voxelize", "live", "motion", "id", "state", "request_id", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -427,6 +470,7 @@ class Job(_message.Message):
     COMPARE_FIELD_NUMBER: _ClassVar[int]
     VOXELIZE_FIELD_NUMBER: _ClassVar[int]
     LIVE_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
@@ -450,6 +494,7 @@ class Job(_message.Message):
     compare: CompareJob
     voxelize: VoxelizeJob
     live: LiveJob
+    motion: MotionJob
     id: str
     state: JobState
     request_id: str
@@ -466,7 +511,7 @@ class Job(_message.Message):
     attempts: int
     owner: str
     private: bool
-    def __init__(self, kind: _Optional[_Union[JobKind, str]] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., live: _Optional[_Union[LiveJob, _Mapping]] = ..., id: _Optional[str] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+    def __init__(self, kind: _Optional[_Union[JobKind, str]] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., live: _Optional[_Union[LiveJob, _Mapping]] = ..., motion: _Optional[_Union[MotionJob, _Mapping]] = ..., id: _Optional[str] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class JobProgress(_message.Message):
     __slots__ = ("step", "steps", "loss", "val_psnr_db", "gaussians", "frames_done", "frames", "rate_per_s", "seconds_left", "waits_for", "method", "method_number", "methods", "phase")

@@ -52,7 +52,7 @@ _COMMANDS = {  # by the panels of the help
         "label": (".labels:label", "Label the Gaussians of a scene by a NIfTI map or by painted frames."),
         "edit": (".editing:edit", "Move, cut, merge, relabel or thin a scene, or insert lesions, as a new one."),
         "from-labels": (".editing:from_labels", "Make a scene that nobody recorded, from a label map or meshes."),
-        "motion": (".motion:motion", "Give a scene a mode of motion: of a sweep with a surrogate, or built in."),
+        "motion": (".motion:motion", "Add a mode of motion to a scene: of a sweep, of a field, or built in."),
         "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
         "slicer": (".scenes:slicer", "Write a scene file of 3D Slicer that shows a served scene live."),
         "import": (".scenes:import_scene", "Turn a PLY file or a released checkpoint into a scene file."),

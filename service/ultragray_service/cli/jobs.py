@@ -54,6 +54,10 @@ _SUBMITS = {
     "compare": ("ultragray jobs submit compare liver --methods scene,median,linear --wait",),
     "evaluate": ("ultragray jobs submit evaluate liver --scene liver --wait",),
     "live": ("ultragray jobs submit live liver --scene liver-live",),
+    "motion": (
+        "ultragray jobs submit motion liver --into liver-breathing --dataset liver --numbers $(paste -sd, belt.csv)",
+        "ultragray jobs submit motion liver --into liver-breathing --chest-mm 8 --wait",
+    ),
     "render": (
         "ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",
         "ultragray jobs submit render liver --sampler around --count 10000000 --height 64 --width 64 --wait",

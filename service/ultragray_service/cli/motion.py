@@ -1,13 +1,18 @@
-"""`ultragray motion`: a new scene file of one whose tissue moves."""
+"""`ultragray motion`: a new scene file of one whose tissue moves. `ultragray jobs submit motion`: on a service."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
+
+import numpy as np
 
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.registration import load_registration
 from ultragray.scene.info import read_header
-from ultragray.scene.modes import FIT_STEPS
+from ultragray.scene.label_maps import LABEL_MAP_SUFFIXES, VECTOR_AXES, read_vector_field
+from ultragray.scene.modes import AUTO, FIELD_LEADS, MotionSettings
+from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     COMPRESSED_SUFFIX,
     SCENE_SUFFIX,
@@ -22,54 +27,92 @@ from ultragray_service.cli.terminal import (
     tell,
 )
 
+_SWEEP, _FIELD = "Learned from frames", "From a field of displacements"
+
 
 @single(
     "ultragray motion liver.ugr -o breathing.ugr --sweep sweep.mha --surrogate belt.csv",
+    "ultragray motion liver.ugr -o breathing.ugr --field inhale.nii.gz --field-leads from-rest --field-axes lps",
     "ultragray motion liver.ugr -o breathing.ugr --chest-mm 8",
+    """ultragray motion breathing.ugr -o both.ugr --pulse-mm 0.5 --vessel '{"kind": "label", "name": "artery"}'""",
 )
+@with_options
 def motion(
     scene: SceneFile,
     output: Annotated[Path, output_option("Scene file to write (.ugr or .ugz).")],
-    sweep: Annotated[str | None, option("The sweep that the scene was trained from.")] = None,
-    surrogate: Annotated[Path | None, option("A number a line for each frame of the sweep, such as a belt's.")] = None,
-    chest_mm: Annotated[float | None, option("Built in: deep tissue goes so far from the skin and back.")] = None,
-    name: Annotated[str, option("Of the mode.")] = "breathing",
-    steps: Annotated[int, option("Of the fit.", min=1, max=100_000)] = FIT_STEPS,
+    sweep: Annotated[str | None, option("The sweep that the scene was trained from.", panel=_SWEEP)] = None,
+    surrogate: Annotated[
+        str | None,
+        option(f"A file with a number a line for each frame, such as a belt's; {AUTO}: found.", panel=_SWEEP),
+    ] = None,
+    field: Annotated[
+        Path | None,
+        option(f"A vector in mm for each voxel ({', '.join(LABEL_MAP_SUFFIXES)}), of a number of 1.", panel=_FIELD),
+    ] = None,
+    field_leads: Annotated[
+        str | None,
+        option(
+            "from-rest: from a point of the tissue at rest to where it goes. to-rest: from a point of moved tissue to "
+            "where it is at rest, as transforms of ITK and Slicer do that resample an image at rest.",
+            metavar="|".join(FIELD_LEADS),
+            panel=_FIELD,
+        ),
+    ] = None,
+    field_axes: Annotated[
+        str | None,
+        option(
+            "Axes of the vectors where a NIfTI file does not say; ITK, ANTs and Slicer write lps.",
+            metavar="|".join(VECTOR_AXES),
+            panel=_FIELD,
+        ),
+    ] = None,
+    registration: Annotated[
+        Path | None,
+        option("File of `ultragray calibrate` (.json) that leads the field into the scene.", panel=_FIELD),
+    ] = None,
     force: Force = False,
     json: Json = False,
+    *,
+    asked: MotionSettings,
 ) -> None:
-    """One mode of motion: learned from a sweep whose frames have a number each, or a chest that breathes."""
+    """One mode more: learned from a sweep, of a field, or built in. `phase` has a number for each, in their order."""
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
     read_header(scene)
-    if (sweep is None) != (surrogate is None) or (sweep is None) == (chest_mm is None):
-        raise InvalidArgument("either --sweep and --surrogate must be given, or --chest-mm", field="sweep")
+    asked.check_source(sweep=sweep is not None, field=field is not None)
+    _check_pairs(sweep=sweep, surrogate=surrogate)
+    _check_pairs(field=field, field_leads=field_leads)
+    link = None if registration is None else load_registration(registration)
+    voxels = None if field is None else read_vector_field(field, field_axes)
 
     from ultragray import GaussianScene
     from ultragray.datasets.source import load_dataset
-    from ultragray.learn.motion import chest_motion, fit_motion, read_numbers, with_motion
+    from ultragray.learn.motion import add_motion, read_numbers
+    from ultragray.learn.motion_fields import field_of_voxels
 
     loaded = GaussianScene.load(scene)
+    sources: dict[str, Any] = {}
     if sweep is not None and surrogate is not None:
-        train = load_dataset(sweep).train
-        numbers = read_numbers(surrogate, int(train.frame_numbers.max()) + 1)[train.frame_numbers]
-        with counted("learning motion", steps) as count:
-            moving = fit_motion(
-                loaded,
-                train,
-                numbers,
-                name=name,
-                surrogate=surrogate.name,
-                steps=steps,
-                report=lambda done, _: count(done),
-            )
-    else:
-        assert chest_mm is not None
-        moving = with_motion(loaded, *chest_motion(loaded.info, chest_mm))
-    moving.save(output)
-    assert moving.info.motion is not None
-    (mode,) = moving.info.motion.modes
-    tell(
-        f"wrote {output}: {mode.name} between {mode.low:g} and {mode.high:g}, at rest at {mode.rest:g}",
-        {"output": str(output), "mode": mode.name, "low": mode.low, "high": mode.high, "rest": mode.rest},
-        as_json=json,
-    )
+        train = sources["sweep"] = load_dataset(sweep).train
+        if surrogate != AUTO:
+            sources |= {"numbers": read_numbers(surrogate, train), "surrogate": Path(surrogate).name}
+    if voxels is not None and field_leads is not None:
+        to_scene = None if link is None else np.asarray(link.base_to_scene)
+        sources["field"] = field_of_voxels(voxels, loaded.info, field_leads, to_scene)
+    with counted("learning motion", asked.steps if sweep else 1) as count_done:
+        added = add_motion(loaded, asked, **sources, report=lambda done, _: count_done(done))
+    added.scene.save(output)
+    facts = added.facts()
+    mode, residual = facts["modes"][-1], facts["residual_mm"]
+    words = f"wrote {output}: {mode['name']} between {mode['low']:g} and {mode['high']:g}, at rest at {mode['rest']:g}"
+    if residual is not None:
+        words += f"; {residual['rms']:.2g} mm (rms) from the field, at most {residual['most']:.2g} mm"
+    if (tube := added.tube) is not None:
+        words += f"; the vessel's radius is {tube.radius_mm:.1f} mm"
+    tell(words, {"output": str(output), **facts}, as_json=json)
+
+
+def _check_pairs(**given: Any) -> None:
+    """Raises InvalidArgument where one of two that belong together is missing."""
+    if len({one is None for one in given.values()}) > 1:
+        names = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise InvalidArgument(f"{names} belong together", field=next(iter(given)))

@@ -1,4 +1,4 @@
-"""Modes of motion that are learned, or built in."""
+"""Modes of motion that are learned from frames."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.learn.motion import chest_motion, fit_motion, read_numbers, with_motion
+from ultragray.learn.motion import fit_motion, read_numbers
 from ultragray.learn.sweep import Sweep
 from ultragray.scene.info import SceneInfo
 
@@ -38,22 +38,15 @@ def test_a_shift_is_learned_from_frames_with_a_number_each(phantom):
         fit_motion(phantom, sweep, np.ones(12))
 
 
-def test_a_built_in_chest_moves_deep_tissue_and_leaves_the_skin(phantom):
-    moving = with_motion(phantom, *chest_motion(phantom.info, 8.0))
-    low, high = phantom.info.bounds_min_mm[2], phantom.info.bounds_max_mm[2]
-    points = torch.tensor([[0.0, 0.0, low], [0.0, 0.0, high]])
-    moved, _ = moving.at_phase((1.0,)).displacements[0].at(points)
-    assert moved[0, 2] < 0.5
-    assert 7.5 < moved[1, 2] < 8.1
-    assert not moved[:, :2].any()
-
-
-def test_numbers_that_are_none_or_too_few_are_refused(tmp_path):
+def test_numbers_that_are_none_or_too_few_are_refused(phantom, tmp_path):
+    images = np.random.default_rng(0).integers(0, 255, (2, 12, 12), np.uint8)
+    sweep = Sweep(images, np.tile(np.eye(4), (2, 1, 1)), PROBE, np.array([0, 2]), "phantom")
     path = tmp_path / "belt.csv"
     path.write_text("1.0\n2.0\n3.0\n")
-    assert read_numbers(path, 3).tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(DatasetInvalid, match="each of 4 frames, got \\[3\\]"):
-        read_numbers(path, 4)
+    assert read_numbers(path, sweep).tolist() == [1.0, 3.0]
+    path.write_text("1.0\n2.0\n")
+    with pytest.raises(DatasetInvalid, match="each of 3 frames, got \\[2\\]"):
+        read_numbers(path, sweep)
     path.write_text("1.0\nbreath\n")
     with pytest.raises(DatasetInvalid, match=r"belt\.csv"):
-        read_numbers(path, 2)
+        read_numbers(path, sweep)

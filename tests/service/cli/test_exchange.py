@@ -64,7 +64,30 @@ def test_a_scene_is_given_a_mode_of_motion_and_rendered_at_a_phase(make_file, tm
         assert (made.exit_code, made.stderr) == (0, "")
         frames.append(np.load(tmp_path / f"{phase}.npz")["bmode"])
     assert not np.array_equal(*frames)
-    assert "either --sweep and --surrogate" in refused("motion", moving, "-o", tmp_path / "none.ugr")
+    none = tmp_path / "none.ugr"
+    assert "exactly one of chest_mm, pulse_mm, sweep, field, got none" in refused("motion", moving, "-o", none)
+    assert "--sweep and --surrogate belong together" in refused("motion", moving, "-o", none, "--sweep", "s.mha")
+    assert "a mode that is called breathing" in refused("motion", moving, "-o", none, "--chest-mm", "8")
+
+
+def test_a_field_of_displacements_becomes_a_mode_beside_a_vessel_that_pulsates(make_file, tmp_path):
+    field, inhaling, both = tmp_path / "inhale.nii.gz", tmp_path / "inhaling.ugr", tmp_path / "both.ugr"
+    vectors = np.broadcast_to([0.0, 0.0, 4.0], (5, 5, 5, 3))
+    affine = np.diag([30.0, 30.0, 30.0, 1.0])
+    affine[:3, 3] = -60.0
+    nibabel.save(nibabel.Nifti1Image(vectors, affine), field)
+    asked = ("motion", make_file(), "-o", inhaling, "--field", field)
+    assert "--field and --field-leads belong together" in refused(*asked)
+    assert "in which axes its vectors are" in refused(*asked, "--field-leads", "from-rest")
+    made = run(*asked, "--field-leads", "from-rest", "--field-axes", "ras", "--json")
+    facts = json.loads(made.stdout)
+    assert facts["residual_mm"]["most"] < 1e-5
+    tube = json.dumps({"kind": "tube", "points_mm": [[0, -20, 15], [0, 20, 15]], "radius_mm": 6})
+    result = run("motion", inhaling, "-o", both, "--pulse-mm", "0.5", "--vessel", tube)
+    assert "pulse between 0 and 1" in result.stdout
+    assert [mode.name for mode in read_header(both).info.motion.modes] == ["breathing", "pulse"]
+    assert run("render", both, "-o", tmp_path / "frame.npz", "--phase", "1,0.5").exit_code == 0
+    assert "one number for each mode" in refused("render", both, "-o", tmp_path / "f.npz", "--phase", "1")
 
 
 def test_a_checkpoint_and_back_by_the_documented_commands(make_file, tmp_path):
