@@ -23,7 +23,7 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import DEMO_PROBE, load_demo_scene
 from ultragray.phantom.sweeps import freehand_poses
 from ultragray.scene.deformation import Displacement
-from ultragray.scene.modes import FIT_STEPS
+from ultragray.scene.motion_settings import FIT_STEPS
 
 THREADS = 2
 SIDE, PASSES, FRAMES, HELD_OUT = 96, 4, 40, 24

@@ -59,7 +59,7 @@ from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray.samplers import AroundSampler
 from ultragray.scene.confidence import Assessor, supported
 from ultragray.scene.edits import InsertEdit
-from ultragray.scene.modes import MotionSettings
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray.scene.shapes import SphereShape, TubeShape
 from ultragray_studies.gym import UltragrayEnv
 from ultragray_studies.hand import Errors, HandSweep

@@ -35,7 +35,8 @@ from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.losses import image_loss
 from ultragray.rendering.frames import render
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
-from ultragray.scene.modes import FIT_STEPS, GIVEN_SPACING_MM, SPACING_MM, Mode, MotionSettings
+from ultragray.scene.modes import Mode
+from ultragray.scene.motion_settings import FIT_STEPS, GIVEN_SPACING_MM, SPACING_MM, MotionSettings
 from ultragray.scene.shapes import LabelShape, TubeShape
 
 Numbers = npt.NDArray[np.float64]

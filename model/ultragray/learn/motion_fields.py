@@ -22,7 +22,8 @@ from ultragray.scene.deformation import LEAST_SIDE, Displacement, along_axes, sp
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo, with_summary
 from ultragray.scene.label_maps import VectorField
-from ultragray.scene.modes import FIELD_LEADS, MAX_COEFFICIENT_BYTES, MAX_SIDE, Mode, Motion, Moving
+from ultragray.scene.modes import MAX_COEFFICIENT_BYTES, MAX_SIDE, Mode, Motion, Moving
+from ultragray.scene.motion_settings import FIELD_LEADS
 from ultragray.scene.shapes import LabelShape, TubeShape
 
 Field: TypeAlias = Callable[[Tensor], Tensor]  # points [N, 3] mm of the tissue at rest -> [N, 3] mm for one unit

@@ -11,7 +11,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.registration import load_registration
 from ultragray.scene.info import read_header
 from ultragray.scene.label_maps import LABEL_MAP_SUFFIXES, VECTOR_AXES, read_vector_field
-from ultragray.scene.modes import AUTO, FIELD_LEADS, MotionSettings
+from ultragray.scene.motion_settings import AUTO, FIELD_LEADS, MotionSettings
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     COMPRESSED_SUFFIX,

@@ -14,7 +14,8 @@ from ultragray.learn.motion import add_motion
 from ultragray.learn.motion_fields import field_of_voxels, pulsation, vessel_of, with_mode
 from ultragray.scene.info import SceneInfo
 from ultragray.scene.label_maps import VectorField, read_vector_field
-from ultragray.scene.modes import Mode, MotionSettings
+from ultragray.scene.modes import Mode
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray.scene.shapes import LabelShape, SphereShape, TubeShape
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)

@@ -9,7 +9,7 @@ import torch
 from ultragray import GaussianScene
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.learn.motion import add_motion
-from ultragray.scene.modes import MotionSettings
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneExists
 from ultragray_workers.jobs.folder import JobFolder

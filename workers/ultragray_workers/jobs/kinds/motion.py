@@ -7,7 +7,7 @@ from typing import Literal
 
 from ultragray.contract import described, kind_field
 from ultragray.errors import InvalidArgument
-from ultragray.scene.modes import MotionSettings
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 MAX_NUMBERS = 100_000

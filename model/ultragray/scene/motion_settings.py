@@ -1,0 +1,67 @@
+"""Settings of a mode of motion that a scene is to get, as the command line and jobs take them. Free of torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidArgument
+from ultragray.geometry.pose import MAX_POSITION_MM
+from ultragray.scene.modes import Motion
+from ultragray.scene.shapes import LabelShape, Shape, TubeShape
+
+FIT_STEPS = 3000  # of the fit of a mode to a sweep
+SPACING_MM, GIVEN_SPACING_MM = 15.0, 6.0  # between splines: of a field that is learned, of one that is given
+AUTO = "auto"  # in the place of a surrogate: the numbers of the frames are found
+FIELD_LEADS = ("from-rest", "to-rest")  # which way the vectors of a field lead
+MAX_MOVED_MM = 100.0  # by what is built in
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSettings(Contract):
+    """A mode of motion that a scene is to get beside those that it has: learned from frames, or built in."""
+
+    __topic__ = "Mode"
+
+    name: str | None = described("Of the mode. Default: breathing; of a vessel: pulse.", None)
+    chest_mm: float | None = described(
+        "Built in: deep tissue goes so far from the skin and back.", None, low=-MAX_MOVED_MM, high=MAX_MOVED_MM
+    )
+    pulse_mm: float | None = described(
+        "Built in: the wall of a vessel goes so far out, and tissue about it makes room.",
+        None,
+        low=-MAX_MOVED_MM,
+        high=MAX_MOVED_MM,
+    )
+    vessel: Shape | None = described("The vessel that pulsates: a tube, or a label of the scene.", None)
+    steps: int = described("Of the fit to frames.", FIT_STEPS, low=1, high=100_000)
+    spacing_mm: float | None = described(
+        f"Between splines of the field. Default: {SPACING_MM:g}; of a field that is given {GIVEN_SPACING_MM:g}; of a "
+        "vessel half its radius, or what there is room for.",
+        None,
+        above=0.0,
+        high=MAX_POSITION_MM,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.pulse_mm is None) != (self.vessel is None):
+            raise InvalidArgument("pulse_mm and vessel belong together", field="vessel")
+        if self.vessel is not None and not isinstance(self.vessel, (LabelShape, TubeShape)):
+            raise InvalidArgument(f"vessel must be of the kind tube or label, got {self.vessel.kind}", field="vessel")
+
+    def check_source(self, **others: bool) -> None:
+        """Raises InvalidArgument unless the mode comes from one place: what is built in, or one of the others."""
+        sources = {"chest_mm": self.chest_mm is not None, "pulse_mm": self.pulse_mm is not None, **others}
+        if sum(sources.values()) != 1:
+            given = ", ".join(name for name, is_given in sources.items() if is_given) or "none"
+            raise InvalidArgument(f"a mode needs exactly one of {', '.join(sources)}, got {given}", field="chest_mm")
+
+    def mode_name(self, motion: Motion | None) -> str:
+        """The name of the mode beside those of a scene. Raises InvalidArgument where one of them has it."""
+        name = self.name or ("breathing" if self.vessel is None else "pulse")
+        if motion is not None and name in (mode.name for mode in motion.modes):
+            raise InvalidArgument(
+                f"the scene has a mode that is called {name} already: give another name", field="name"
+            )
+        return name
