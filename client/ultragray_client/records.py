@@ -43,6 +43,18 @@ class ConfidenceFit:
     fitted_on: int  # how many those are
 
 
+@dataclass(frozen=True)
+class Mode:
+    """A way in which the tissue of a scene moves."""
+
+    name: str  # such as breathing
+    low: float  # the least number that a frame was seen with
+    high: float  # the greatest
+    rest: float  # the number at which the tissue is where the scene has it
+    unit: str  # of the number; empty: it has none
+    surrogate: str  # what told the number, such as a belt
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A scene; None, 0 or empty where it is not known."""
@@ -69,6 +81,7 @@ class Scene:
     label_names: Mapping[int, str]  # what the values of the output labels mean
     beam: ElevationBeam | None  # of the frames it was trained on; None: they are taken for planes
     confidence: ConfidenceFit | None  # None: it cannot tell the confidence of its frames
+    modes: tuple[Mode, ...]  # by which its tissue moves, a number of `phase` for each; empty: it is still
     speckle: bool  # whether its frames can have natural speckle
     owner: str | None  # None: nobody
     private: bool  # others do not see it
@@ -93,6 +106,7 @@ def scene_from_message(message: scenes_pb2.Scene) -> Scene:
         training_position_min_mm=known and known.position_min_mm,
         training_position_max_mm=known and known.position_max_mm,
         training_poses=(known.first, known.middle, known.last) if known else (),
+        modes=tuple(from_message(mode, Mode) for mode in message.motion.modes),
     )
 
 
