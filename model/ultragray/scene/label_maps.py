@@ -41,6 +41,7 @@ _TO_RAS = {  # by the words of `space`
     **dict.fromkeys(("left-anterior-superior", "las"), (-1.0, 1.0, 1.0)),
     **dict.fromkeys(("left-posterior-superior", "lps"), (-1.0, -1.0, 1.0)),
 }
+_MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}  # of NIfTI, by nibabel's words
 _ZLIB_OR_GZIP = 47  # zlib's window bits for either kind of header
 
 
@@ -59,7 +60,8 @@ def read_label_map(path: str | Path) -> LabelMap:
     """
     values, affine = read_volume(path, field="label_map")
     if not (values.dtype.kind in "iuf" and (values >= 0).all() and (values <= MAX_LABEL).all()):
-        raise InvalidArgument(f"label_map must hold numbers from 0 to {MAX_LABEL}", field="label_map")
+        range_words = f", it holds {values.min():g} to {values.max():g}" if values.dtype.kind in "iuf" else ""
+        raise InvalidArgument(f"label_map must hold numbers from 0 to {MAX_LABEL}{range_words}", field="label_map")
     volume = values.astype(np.uint8)
     if not np.array_equal(volume, values):
         raise InvalidArgument("label_map must hold whole numbers: labels cannot be interpolated", field="label_map")
@@ -132,14 +134,26 @@ def _read_nifti(path: Path, field: str, vectors: bool) -> _Read:
     image: Any = nibabel.load(path)
     shape = tuple(side for place, side in enumerate(image.shape) if place < 3 or side != 1)
     _check_volume(shape, field, vectors)
-    axes = "ras" if int(image.header["intent_code"]) == _INTENT_DISPLACEMENT else None
-    return np.asanyarray(image.dataobj).reshape(shape), np.asarray(image.affine, np.float64), axes
+    header, affine = image.header, np.array(image.affine, np.float64)
+    if not (header["qform_code"] or header["sform_code"]):
+        raise InvalidArgument(
+            f"{path.name} does not say where it lies, nor which side is left: its qform_code and sform_code are 0",
+            field=field,
+        )
+    unit, _ = header.get_xyzt_units()
+    if vectors and _MM_PER_UNIT[unit] != 1.0:
+        raise InvalidArgument(f"{path.name} must be in mm, its lengths are in {unit}", field=field)
+    affine[:3] *= _MM_PER_UNIT[unit]
+    axes = "ras" if int(header["intent_code"]) == _INTENT_DISPLACEMENT else None
+    return np.asanyarray(image.dataobj).reshape(shape), affine, axes
 
 
 def _check_volume(shape: Sequence[int], field: str, vectors: bool) -> None:
     if len(shape) != 3 + vectors or shape[3:] not in ((), (3,)) or not 0 < math.prod(shape) <= MAX_VOXELS:
-        what = "three numbers a voxel, of" if vectors else "a volume of"
-        raise InvalidArgument(f"{field} must be {what} at most {MAX_VOXELS:,}, it is {list(shape)}", field=field)
+        what = "a volume of three numbers a voxel" if vectors else "one volume"
+        raise InvalidArgument(
+            f"{field} must be {what}, of at most {MAX_VOXELS:,} numbers, it is {list(shape)}", field=field
+        )
 
 
 def _read_nrrd(path: Path, field: str, vectors: bool) -> _Read:
@@ -164,6 +178,9 @@ def _read_nrrd(path: Path, field: str, vectors: bool) -> _Read:
         raise ValueError(f"truncated: it holds {len(voxels)} of {expected} bytes")
     order: Literal["<", ">"] = ">" if fields.get("endian", "little").lower() == "big" else "<"
     values = np.frombuffer(voxels[:expected], dtype.newbyteorder(order)).reshape(sizes, order="F")
+    units = set(re.findall(r'"([^"]+)"', fields.get("space units", ""))) - {"mm", "millimeter"}
+    if units:
+        raise ValueError(f"its space units must be mm, they are {', '.join(sorted(units))}")
     space, affine = fields["space"].lower(), np.eye(4)
     affine[:3] = (_vectors_in(f"{fields['space directions']} {fields['space origin']}") * _TO_RAS[space]).T
     if vectors:

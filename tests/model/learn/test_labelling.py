@@ -172,8 +172,8 @@ def test_what_is_no_label_is_refused(scene, tmp_path):
     np.savez(tmp_path / "frames.npz", poses=np.eye(4)[None])
     for path, words in [
         (file(np.full((2, 2, 2), 0.5, np.float32)), "whole numbers"),
-        (file(np.full((2, 2, 2), 300, np.int16)), "0 to 255"),
-        (file(np.zeros((2, 2, 2, 2), np.uint8)), "a volume"),
+        (file(np.full((2, 2, 2), 300, np.int16)), "0 to 255, it holds 300 to 300"),
+        (file(np.zeros((2, 2, 2, 2), np.uint8)), "one volume"),
         (tmp_path / "text.nii", "NIfTI"),
         (tmp_path / "no.nii", "NIfTI"),
         (tmp_path / "map.png", "must end in"),
@@ -188,3 +188,24 @@ def test_what_is_no_label_is_refused(scene, tmp_path):
         np.savez(tmp_path / "frames.npz", poses=np.eye(4)[None], labels=np.array(labels).reshape(len(labels), 1, 1))
         with pytest.raises(InvalidArgument, match="whole numbers"):
             read_painted(tmp_path / "frames.npz")
+
+
+def test_a_label_map_in_metres_is_read_in_millimetres_and_one_without_a_place_is_refused(tmp_path):
+    affine = np.array([[2.0, 0.0, 0.0, -30.0], [0.0, 0.0, 3.0, 20.0], [0.0, 4.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
+    for unit, per_mm in (("mm", 1.0), ("meter", 1e-3), ("micron", 1e3)):
+        image = nibabel.Nifti1Image(np.ones((2, 3, 4), np.uint8), np.diag([per_mm, per_mm, per_mm, 1.0]) @ affine)
+        image.header.set_xyzt_units(unit)
+        nibabel.save(image, tmp_path / "map.nii")
+        np.testing.assert_allclose(read_label_map(tmp_path / "map.nii").affine, affine, rtol=1e-6)
+    image.header["qform_code"] = image.header["sform_code"] = 0
+    image.header.set_xyzt_units("mm")
+    nibabel.save(nibabel.Nifti1Image(image.dataobj, None, image.header), tmp_path / "map.nii")
+    with pytest.raises(InvalidArgument, match="which side is left"):
+        read_label_map(tmp_path / "map.nii")
+    head = (
+        "NRRD0004\ntype: uchar\ndimension: 3\nspace: left-posterior-superior\nsizes: 1 1 1\nencoding: raw\n"
+        'space directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (0,0,0)\nspace units: "m" "m" "m"\n\n'
+    )
+    (tmp_path / "map.nrrd").write_bytes(head.encode() + b"\1")
+    with pytest.raises(InvalidArgument, match="space units must be mm, they are m"):
+        read_label_map(tmp_path / "map.nrrd")
