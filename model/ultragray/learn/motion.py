@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -46,10 +47,11 @@ BATCH = 4
 RATES = {"means": 1e-2, "scales": 1e-2, "quats": 1e-2, "transmittances": 1e-2, "sh0": 2e-2, "shN": 1e-4}
 FIELD_RATE_MM = 0.25  # a step, of the displacement from end to end
 BENDING = 1e-3  # price of a squared second difference of the field, 1/mm²
-TEXTURE = 0.5  # share of 1 − SSIM in the loss
-LEVEL_RATE = 0.1  # a step, of numbers that are to be found
-STEADY = 1e-3  # price of their squared second difference in time
-FIRST, BEGIN_MM = 0.15, 3.0  # share of the steps that look for numbers alone, and the field that they do it by
+TEXTURE = 0.05  # share of 1 − SSIM in the loss
+LEVELS = tuple(np.linspace(-1.5, 1.5, 25).tolist())  # shares of the field among which those of frames are looked for
+ROUNDS, STEADY = 6, 0.1  # how often, and the price of a squared step of them from frame to frame
+FLOW_PIXELS = 1.5  # standard deviation by which frames are smoothed, before they are compared
+BEGIN_MM = 3.0  # by which deep tissue is taken to move for a share of 1
 
 
 class Added(NamedTuple):
@@ -166,35 +168,46 @@ def find_motion(
     spacing_mm: float = SPACING_MM,
     report: Report = lambda step, loss: None,
 ) -> tuple[GaussianScene, Numbers]:  # [F] from 0 to 1
-    """As `fit_motion`, where nothing told the numbers of the frames: they are found, by how frames disagree with the
-    still scene where poses agree, and greater ones have tissue farther along the beams.
+    """As `fit_motion`, where nothing told the numbers of the frames: they are found, greater ones for deeper tissue.
 
-    Field and numbers enter as a product, of which neither can begin at 0: deep tissue is taken to move along the beams
-    until numbers have been found for that (FIRST); from then on all is learned together. Frames that follow each other
-    have numbers alike (STEADY).
+    They begin with how tissue goes from frame to frame (`depths_in_time`). Then, by turns, all is learned with these
+    for a while, and each frame gets the number of LEVELS at which the scene looks most like it.
     """
+    in_time = np.argsort(sweep.frame_numbers, kind="stable")
+    levels = torch.zeros(len(sweep))
+    levels[in_time] = torch.from_numpy(depths_in_time(sweep.images[in_time])).float()
     fit = _Fit(scene, sweep, Grid.over(scene.info, spacing_mm))
-    beams = torch.from_numpy(sweep.poses[:, :3, 2].mean(axis=0)).float()
-    fit.begin_with(beams)
-    levels = torch.zeros(len(sweep), requires_grad=True)
-    optimizer = torch.optim.Adam([levels], lr=LEVEL_RATE)
-    in_time = torch.from_numpy(np.argsort(sweep.frame_numbers, kind="stable"))
+    fit.begin_with(torch.from_numpy(sweep.poses[:, :3, 2].mean(axis=0)).float())
     for step in range(steps):
-        done = step / steps
-        optimizer.zero_grad()
-        (STEADY * levels[in_time].diff(n=2).square().mean()).backward()  # type: ignore[no-untyped-call]
-        loss = fit.step(done, levels, only_shares=done < FIRST)
-        optimizer.param_groups[0]["lr"] = LEVEL_RATE * 0.05**done
-        optimizer.step()
-        report(step + 1, loss)
-    found, field = levels.detach().double().numpy(), fit.field.detach()
-    if float((field @ beams).mean()) < 0.0:
-        found, field = -found, -field
+        if step and step * ROUNDS // steps > (step - 1) * ROUNDS // steps:
+            levels = fit.levels(in_time)
+        report(step + 1, fit.step(step / steps, levels))
+    found = levels.double().numpy()
     low, span = found.min(), np.ptp(found)
     if not span > 0.0:
         raise InvalidArgument("the frames tell of no motion: their numbers are all the same", field="surrogate")
     mode = Mode(name, 0.0, 1.0, float(-low / span), surrogate="found in the frames")
-    return fit.scene_with(mode, field * span), (found - low) / span
+    return fit.scene_with(mode, fit.field.detach() * span), (found - low) / span
+
+
+def depths_in_time(images: npt.NDArray[np.uint8]) -> Numbers:  # [F, H, W] in time -> [F] from -1 to 1
+    """How deep tissue is in each frame, but for what changes slowly, as anatomy does along a sweep.
+
+    From a frame to the next, rows go down by s·w with w from 0 at the face to 1: by least squares, s is that of which
+    −s·w·∂I/∂row explains most of what changes. Their sum, less its mean over one and a half of the strongest period,
+    is the depth.
+    """
+    smooth = np.stack([cv2.GaussianBlur(image.astype(np.float32), (0, 0), FLOW_PIXELS) for image in images])
+    slopes = np.gradient(smooth, axis=1) * np.linspace(0.0, 1.0, images.shape[1])[None, :, None]
+    slopes = (slopes[1:] + slopes[:-1]) / 2.0
+    moved = -(slopes * np.diff(smooth, axis=0)).sum(axis=(1, 2)) / np.maximum(np.square(slopes).sum(axis=(1, 2)), 1e-9)
+    depth = np.concatenate([[0.0], np.cumsum(moved)])
+    cycles = 1 + int(np.abs(np.fft.rfft(moved - moved.mean()))[1:].argmax())
+    half = min(round(0.75 * len(images) / cycles), len(images) - 1)
+    window = np.hanning(2 * half + 3)[1:-1]
+    depth -= np.convolve(np.pad(depth, half, mode="reflect"), window / window.sum(), "valid")
+    found: Numbers = depth / max(float(np.abs(depth).max()), 1e-9)
+    return found
 
 
 class _Fit:
@@ -225,28 +238,55 @@ class _Fit:
         share = (depth - depth.min()) / (depth.max() - depth.min())
         self.field.data = (BEGIN_MM * share[..., None] * beams)[None]
 
-    def step(self, done: float, shares: Tensor, *, only_shares: bool = False) -> float:  # [F] -> loss
-        """One step of a batch, when a share of all steps is done; gradients reach the frames' shares of the field."""
-        sweep = self._sweep
-        batch = torch.randperm(len(sweep), generator=self._generator)[:BATCH].numpy()
-        moved = self._grid.displacement(shares[batch, None, None, None, None] * self.field)
-        frames = render(
-            self._trained.under(moved),
-            sweep.probe,
-            sweep.poses[batch],
-            height=sweep.height,
-            width=sweep.width,
-            outputs=("bmode",),
-        )
+    @torch.no_grad()
+    def levels(self, in_time: npt.NDArray[np.int64]) -> Tensor:  # [F] frames -> [F] shares of the field
+        """The share at which each frame looks most like the scene, those that follow each other alike: the path through
+        all frames in time whose squared errors and squared steps (STEADY) cost least.
+        """
+        places = torch.from_numpy(in_time)
+        errors = torch.zeros((len(places), len(LEVELS)))
+        for batch in places.split(16):
+            truth = self._truth[batch].float() / 255.0
+            for column, level in enumerate(LEVELS):
+                shown = self._rendered(batch, torch.full((len(batch),), level))
+                errors[batch, column] = (shown - truth).square().mean(dim=(1, 2))
+        errors = errors[places]  # in time
+        errors /= (errors.amax(dim=1) - errors.amin(dim=1)).mean()
+        steps = STEADY * (torch.tensor(LEVELS)[:, None] - torch.tensor(LEVELS)).square()
+        reached, before = errors[0], []
+        for error in errors[1:]:
+            least = (reached + steps).min(dim=1)
+            reached, before = error + least.values, [*before, least.indices]
+        path = [int(reached.argmin())]
+        for come_from in reversed(before):
+            path.append(int(come_from[path[-1]]))
+        found = torch.zeros(len(places))
+        found[places] = torch.tensor(LEVELS)[path[::-1]]
+        return found
+
+    def step(self, done: float, shares: Tensor) -> float:  # [F] -> loss
+        """One step of a batch, when a share of all steps is done."""
+        batch = torch.randperm(len(shares), generator=self._generator)[:BATCH]
         truth = self._truth[batch].float() / 255.0
-        loss = image_loss(frames["bmode"], truth, TEXTURE) + BENDING * _bending(self.field)
+        loss = image_loss(self._rendered(batch, shares[batch]), truth, TEXTURE) + BENDING * _bending(self.field)
         for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * 0.05**done
         self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        if not only_shares:
-            self._optimizer.step()
+        self._optimizer.step()
         return float(loss.detach())
+
+    def _rendered(self, frames: Tensor, shares: Tensor) -> Tensor:  # [C] both -> [C, H, W]
+        sweep = self._sweep
+        moved = self._grid.displacement(shares[:, None, None, None, None] * self.field)
+        return render(
+            self._trained.under(moved),
+            sweep.probe,
+            sweep.poses[frames.numpy()],
+            height=sweep.height,
+            width=sweep.width,
+            outputs=("bmode",),
+        )["bmode"]
 
     def scene_with(self, mode: Mode, field: Tensor) -> GaussianScene:  # [1, X, Y, Z, 3] mm for one unit
         """What was learned, as a scene with one mode more."""

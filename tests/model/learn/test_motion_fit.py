@@ -6,7 +6,7 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.learn.motion import fit_motion, read_numbers
+from ultragray.learn.motion import find_motion, fit_motion, read_numbers
 from ultragray.learn.sweep import Sweep
 from ultragray.scene.info import SceneInfo
 
@@ -19,16 +19,23 @@ def phantom(random_scene):
     return GaussianScene.from_splats(still.splats, info=SceneInfo(probe=PROBE))
 
 
-def test_a_shift_is_learned_from_frames_with_a_number_each(phantom):
+NUMBERS = np.tile([11.5, 12.0, 11.5, 10.5, 10.0, 10.5], 2)
+
+
+@pytest.fixture
+def sweep(phantom):
+    """Frames of tissue that goes 1.5 mm deeper for each unit."""
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, 1, 3] = np.linspace(-2.0, 2.0, 12)
-    numbers = np.tile([10.0, 11.0, 12.0], 4)
     seen = poses.copy()
-    seen[:, 2, 3] -= 1.5 * (numbers - 11.0)  # tissue goes 1.5 mm deeper for each unit
+    seen[:, 2, 3] -= 1.5 * (NUMBERS - 11.0)
     frames = render(phantom, PROBE, seen, height=40, width=30).bmode
-    sweep = Sweep((255.0 * frames).byte().numpy(), poses, PROBE, np.arange(12), "phantom")
+    return Sweep((255.0 * frames).byte().numpy(), poses, PROBE, np.arange(12), "phantom")
+
+
+def test_a_shift_is_learned_from_frames_with_a_number_each(phantom, sweep):
     torch.manual_seed(0)
-    moving = fit_motion(phantom, sweep, numbers, surrogate="belt", steps=80, spacing_mm=20.0)
+    moving = fit_motion(phantom, sweep, NUMBERS, surrogate="belt", steps=80, spacing_mm=20.0)
     (mode,) = moving.info.motion.modes
     assert (mode.low, mode.high, mode.rest, mode.surrogate) == (10.0, 12.0, 11.0, "belt")
     middle = torch.tensor([[0.0, 0.0, 20.0]])
@@ -36,6 +43,18 @@ def test_a_shift_is_learned_from_frames_with_a_number_each(phantom):
     assert shift[[0, 2]].abs().max() < 0.4, shift
     with pytest.raises(InvalidArgument, match="and differ"):
         fit_motion(phantom, sweep, np.ones(12))
+
+
+def test_numbers_that_nobody_told_are_found_with_the_field(phantom, sweep):
+    moving, found = find_motion(phantom, sweep, steps=160, spacing_mm=20.0)
+    assert np.corrcoef(found, NUMBERS)[0, 1] > 0.98, found
+    assert (found.min(), found.max()) == (0.0, 1.0)
+    (mode,) = moving.info.motion.modes
+    assert 0.2 < mode.rest < 0.8
+    middle = torch.tensor([[0.0, 0.0, 20.0]])
+    shift = moving.at_phase((1.0,)).displacements[0].at(middle)[0][0]
+    shift -= 0.0 if mode.rest == 0.0 else moving.at_phase((0.0,)).displacements[0].at(middle)[0][0]
+    assert abs(float(shift[2]) - 3.0) < 0.6, shift
 
 
 def test_numbers_that_are_none_or_too_few_are_refused(phantom, tmp_path):
