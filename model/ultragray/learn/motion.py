@@ -245,7 +245,7 @@ class _Fit:
         """
         places = torch.from_numpy(in_time)
         errors = torch.zeros((len(places), len(LEVELS)))
-        for batch in places.split(16):
+        for batch in torch.split(places, 16):
             truth = self._truth[batch].float() / 255.0
             for column, level in enumerate(LEVELS):
                 shown = self._rendered(batch, torch.full((len(batch),), level))
@@ -253,7 +253,8 @@ class _Fit:
         errors = errors[places]  # in time
         errors /= (errors.amax(dim=1) - errors.amin(dim=1)).mean()
         steps = STEADY * (torch.tensor(LEVELS)[:, None] - torch.tensor(LEVELS)).square()
-        reached, before = errors[0], []
+        reached = errors[0]
+        before: list[Tensor] = []
         for error in errors[1:]:
             least = (reached + steps).min(dim=1)
             reached, before = error + least.values, [*before, least.indices]
