@@ -18,6 +18,7 @@ MAY_IMPORT = {
     "ultragray_ros": {"ultragray_client"},
     "ultragray_workers": {"ultragray"},
     "ultragray_service": {"ultragray", "ultragray_workers", "ultragray_proto", "ultragray_client"},
+    "ultragray_studies": {"ultragray", "ultragray_workers", "ultragray_service", "ultragray_client"},
 }
 # The library: each storey imports those before it and what lies beneath all; plug-ins stand beside.
 STOREYS = ("geometry", "scene", "rendering", "learn")
@@ -82,42 +83,33 @@ def test_no_module_imports_itself_by_way_of_others():
         pytest.fail(" → ".join(error.args[1]))
 
 
-@pytest.mark.parametrize("package", MAY_IMPORT)
-def test_distributions_import_only_those_below_them(package):
-    wrong = {
+def forbidden(rooms, may):
+    """The imports between modules, whose rooms are told, from a room that may not import from that of the other."""
+    return {
         (name, other)
-        for name in modules()
-        if name.partition(".")[0] == package
-        for other in imports_of(name)
-        if other.partition(".")[0] not in {package, *MAY_IMPORT[package]}
+        for name, room in rooms.items()
+        for other in imports_of(name) & rooms.keys()
+        if not may(room, rooms[other])
     }
-    assert wrong == set()
+
+
+def rooms_of(distribution):
+    parts = ((name, (*name.split("."), "")) for name in modules())
+    return {name: room for name, (top, room, *_) in parts if top == distribution}
+
+
+def test_distributions_import_only_those_below_them():
+    rooms = {name: name.partition(".")[0] for name in modules()}
+    assert forbidden(rooms, lambda room, other: other in {room, *MAY_IMPORT[room]}) == set()
 
 
 def test_rooms_of_the_library_import_only_those_below_them():
-    inside = {name: (*name.split("."), "")[1] for name in modules() if name.partition(".")[0] == "ultragray"}
-    wrong = {
-        (name, other)
-        for name, room in inside.items()
-        for other in imports_of(name) & inside.keys()
-        if inside[other] not in {room, *ROOMS[room]}
-    }
-    assert wrong == set()
+    assert forbidden(rooms_of("ultragray"), lambda room, other: other in {room, *ROOMS[room]}) == set()
 
 
 def test_rooms_of_the_service_import_only_those_before_them():
-    places = {
-        name: SERVICE_ROOMS.index((*name.split("."), "")[1])
-        for name in modules()
-        if name.partition(".")[0] == "ultragray_service"
-    }
-    wrong = {
-        (name, other)
-        for name, place in places.items()
-        for other in imports_of(name) & places.keys()
-        if places[other] > place
-    }
-    assert wrong == set()
+    places = {name: SERVICE_ROOMS.index(room) for name, room in rooms_of("ultragray_service").items()}
+    assert forbidden(places, lambda place, other: other <= place) == set()
 
 
 def test_every_module_says_what_it_is_for():
