@@ -153,22 +153,20 @@ OUTPUT_SCHEMA: dict[str, Any] = {  # JSON Schema of the name of an output
 }
 
 
-def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[str, ...]:
+def check_outputs(outputs: Sequence[str]) -> tuple[str, ...]:
     """`outputs` without repetitions, in the given order. Raises UnknownOutput for an unknown name or an empty list."""
     names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in names:
         if name not in OUTPUTS:
-            raise UnknownOutput(f"{field} must be some of {', '.join(OUTPUTS)}, got {name!r}", field=field)
+            raise UnknownOutput(f"outputs must be some of {', '.join(OUTPUTS)}, got {name!r}", field="outputs")
     if not names:
-        raise UnknownOutput(f"{field} must name at least one of {', '.join(OUTPUTS)}, got none", field=field)
+        raise UnknownOutput(f"outputs must name at least one of {', '.join(OUTPUTS)}, got none", field="outputs")
     return tuple(dict.fromkeys(names))
 
 
-def check_available(
-    outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False, field: str = "outputs"
-) -> None:
+def check_available(outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False) -> None:
     for name in outputs:
         if with_tools and OUTPUTS[name].shows_tools_alone:
             continue
         if (lacking := OUTPUTS[name].lacks(info)) is not None:
-            raise UnknownOutput(f"{field} may name {name} only for a scene {lacking}", field=field)
+            raise UnknownOutput(f"outputs may name {name} only for a scene {lacking}", field="outputs")

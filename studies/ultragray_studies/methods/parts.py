@@ -94,11 +94,11 @@ class Similarity:
         luminance, contrast = self._maps(x[:, None], y[:, None])
         return (luminance * contrast).mean()
 
-    def ms_ssim(self, x: Tensor, y: Tensor, scales: int = len(SCALE_WEIGHTS)) -> Tensor:  # [C, H, W] both -> scalar
-        """The mean over the images of MS-SSIM on as many of `scales` as hold a window, their weights adding to 1."""
+    def ms_ssim(self, x: Tensor, y: Tensor) -> Tensor:  # [C, H, W] both -> scalar
+        """The mean over the images of MS-SSIM on as many scales as hold a window, their weights adding to 1."""
         x, y = x[:, None], y[:, None]
         held = 1
-        while held < scales and min(x.shape[-2:]) // 2**held >= self.window:
+        while held < len(SCALE_WEIGHTS) and min(x.shape[-2:]) // 2**held >= self.window:
             held += 1
         weights = torch.tensor(SCALE_WEIGHTS[:held], dtype=x.dtype, device=x.device)
         factors = []

@@ -38,7 +38,7 @@ def thin(scene: GaussianScene, edit: ThinEdit) -> GaussianScene:
     return part(scene, chosen)
 
 
-def importance(scene: GaussianScene, *, backend: str = "auto") -> Tensor:  # [N]
+def importance(scene: GaussianScene) -> Tensor:  # [N]
     """How much of B-mode each Gaussian makes in frames at training poses: as echo, and as what it takes from others.
 
     As echo: the sum over pixels of its share w/S of what is seen there, γ·T. As attenuation: the sum of what pixels
@@ -50,7 +50,7 @@ def importance(scene: GaussianScene, *, backend: str = "auto") -> Tensor:  # [N]
     if probe is None or not len(rest.training_poses):
         raise InvalidArgument("thin needs a scene that knows its training poses and its probe", field="kind")
     height, width = (min(side, MAX_SIDE) for side in scene.info.image_size_or(None, None))
-    draw = BACKENDS[choose_backend(backend, scene)].draw
+    draw = BACKENDS[choose_backend("auto", scene)].draw
     found = scene.means.new_zeros(len(scene.means))
     beam = beam_cm(scene.info.beam, probe)
     with torch.enable_grad():
