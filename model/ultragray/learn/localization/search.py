@@ -133,8 +133,9 @@ def localize(
         )
     stages = TRACKING if asked.search is SearchKind.TRACK else STAGES
     for stage in stages:
-        poses = looked.improve(poses, stage)
-    found = looked.result(poses[0], first[0], stages[-1])
+        fit = looked.improve(poses, stage)
+        poses = fit.poses
+    found = looked.result(fit, first[0], stages[-1])
     return replace(found, pose=scene.poses_as_tracked(found.pose[None])[0])
 
 
@@ -338,6 +339,11 @@ class _Fit:
             self.corrections + 1,
         )
 
+    def best(self, count: int) -> _Fit:
+        """The fit at the poses that fit best, the first of equals first."""
+        which = self.error.argsort(stable=True)[:count]
+        return _Fit(self.poses[which], self.left[which], self.changes[which], self.corrections[which])
+
     def replaced(self, which: Tensor, other: _Fit) -> _Fit:  # [K], of poses that the other has
         """The fit, some of whose poses have been taken anew."""
         parts = ((self.left, other.left), (self.changes, other.changes), (self.corrections, other.corrections))
@@ -350,6 +356,7 @@ class _Search:
     def __init__(self, frame: Tensor, probe: Probe, motions: Motions, rendered: Rendered) -> None:
         self._frame, self._probe, self._motions, self._rendered = frame, probe, motions, rendered
         self._known: dict[tuple[bytes, int, int], Tensor] = {}  # frames by pose, rows and columns
+        self._targets: dict[Stage, tuple[Scale, Tensor]] = {}
 
     def begin(self, starts: Tensor) -> Tensor:  # [S, 4, 4] -> [K, 4, 4]
         """The starts that look most like the frame, the given one first among equals."""
@@ -359,7 +366,7 @@ class _Search:
         left = self._left(starts, scale, target).square().mean(dim=1)
         return starts[left.argsort(stable=True)[:MOST_BEGUN]]
 
-    def improve(self, poses: Tensor, stage: Stage) -> Tensor:  # [K, 4, 4] -> the best `kept`
+    def improve(self, poses: Tensor, stage: Stage) -> _Fit:  # [K, 4, 4] -> of the best `kept`
         """Steps of Levenberg and Marquardt for all poses at once."""
         scale, target = self._at(stage)
         fit = self._linearised(poses, stage, scale, target)
@@ -378,12 +385,13 @@ class _Search:
             doubtful = is_misled | (has_arrived & ~was_fresh) | (better & (fit.corrections >= stage.corrected))
             if left and doubtful.any():
                 fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
-        return fit.poses[fit.error.argsort(stable=True)[: stage.kept]]
+        return fit.best(stage.kept)
 
-    def result(self, pose: Tensor, start: Tensor, stage: Stage) -> Localization:
-        """What is told of the best pose, by the last stage."""
-        scale, target = self._at(stage)
-        fit = self._linearised(pose[None], stage, scale, target, ALL if stage is LAST else stage.rendered)
+    def result(self, fit: _Fit, start: Tensor, stage: Stage) -> Localization:
+        """What is told of the best pose of the last stage: of a search by all numbers, of a track by its last step."""
+        (scale, target), pose = self._at(stage), fit.poses[0]
+        if stage is LAST:
+            fit = self._linearised(pose[None], stage, scale, target, ALL)
         similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
         deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
@@ -399,9 +407,11 @@ class _Search:
 
     def _at(self, stage: Stage) -> tuple[Scale, Tensor]:
         """The scale of a stage, not finer than the frame, and what the frame looks like there."""
-        rows, columns = min(stage.rows, self._frame.shape[0]), min(stage.columns, self._frame.shape[1])
-        scale = Scale.of(self._probe, rows, columns, stage.smoothing_mm)
-        return scale, scale.appearance(scale.resized(self._frame)[None])[0]
+        if stage not in self._targets:
+            rows, columns = min(stage.rows, self._frame.shape[0]), min(stage.columns, self._frame.shape[1])
+            scale = Scale.of(self._probe, rows, columns, stage.smoothing_mm)
+            self._targets[stage] = scale, scale.appearance(scale.resized(self._frame)[None])[0]
+        return self._targets[stage]
 
     def _left(self, poses: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [K, 4, 4] -> [K, pixels]
         return _missed(self._frames(poses, scale.rows, scale.columns), scale, target)
@@ -424,9 +434,9 @@ class _Search:
         """The fit at poses [K, 4, 4], and its changes, by frames on either side for the numbers that are `rendered`."""
         size, numbers = (scale.rows, scale.columns), list(stage.rendered if rendered is None else rendered)
         motions = _beside(self._probe, stage.probing_mm)[:, numbers]
-        here = scale.appearance(self._frames(poses, *size))  # [K, H, W]
-        frames = self._frames((poses[:, None, None] @ motions).reshape(-1, 4, 4), *size)
-        after = scale.appearance(frames).reshape(len(poses), 2, -1, *size)
+        every = torch.cat([poses, (poses[:, None, None] @ motions).reshape(-1, 4, 4)])
+        seen = scale.appearance(self._frames(every, *size))
+        here, after = seen[: len(poses)], seen[len(poses) :].reshape(len(poses), 2, -1, *size)
         differences = (after[:, 0] - after[:, 1]) / (2.0 * stage.probing_mm)
         gradient = torch.stack([*torch.gradient(here, dim=(1, 2)), differences[:, numbers.index(ELEVATION)]], dim=1)
         changes = torch.einsum("kdhw,sdhw->kshw", gradient, displacements(self._probe, *size))
