@@ -27,6 +27,7 @@ from ultragray.learn.evaluation.scoring import rendered_parts
 from ultragray.learn.sweep import HELD_OUT_START, HELD_OUT_STEP, Dataset, Sweep, split_sequence
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.learn.training.confidence import path_mm
+from ultragray.learn.training.poses import PoseRefinement
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.datasets.recording import RecordedFrame, RecordingSettings
 from ultragray_workers.datasets.store import open_datasets
@@ -122,10 +123,13 @@ def followed(sweep: Sweep, kills: int) -> list[Version]:
                 continue
 
 
-def psnrs_db(scene: GaussianScene, sweep: Sweep) -> np.ndarray:  # [F]
-    """PSNR of a scene on the frames of a sweep."""
+def psnrs_db(scene: GaussianScene, recorded: Sweep, on_path: Sweep) -> np.ndarray:  # [F]
+    """PSNR of a scene on held-out frames: at the poses of the path that it was trained on, as that of `fast` is; of a
+    scene that took poses as they came at those.
+    """
     found: list[float] = []
-    for some, frames in rendered_parts(scene, sweep, ("bmode",), "auto"):
+    sweep = recorded if scene.rest_poses is None and scene.pose_corrections is None else on_path
+    for some, frames in rendered_parts(scene.at_rest(), sweep, ("bmode",), "auto"):
         truth = torch.from_numpy(some.images).float().div_(255.0)
         found += [one.psnr_db for one in frame_metrics(frames["bmode"].float(), truth)]
     return np.array(found)
@@ -138,8 +142,9 @@ def run(name: str, data_folder: Path) -> Document:
     part = Dataset(name, *split_sequence(sweep, len(sweep), None, None))
     linear = np.array([one.psnr_db for one in evaluate_baselines(part, ("linear",), 1.0)["linear"].frames])
     arrivals_s = np.arange(HELD_OUT_START, len(sweep), HELD_OUT_STEP) / RATE_HZ
+    frames = part.val, PoseRefinement.of(part, "path").dataset.val
     versions = followed(sweep, 0)
-    shown = np.stack([psnrs_db(one.scene, part.val) for one in versions])  # [V, F]
+    shown = np.stack([psnrs_db(one.scene, *frames) for one in versions])  # [V, F]
     times_s = np.array([one.at_s for one in versions])
     waits_s = []
     for place, arrival_s in enumerate(arrivals_s):
@@ -164,7 +169,7 @@ def run(name: str, data_folder: Path) -> Document:
         "fast_db": float(fast.info.metrics["psnr_db"]),
         "fast_s": time.process_time() - begun_s,
         "live_db": float(shown[at_end].mean()),
-        "killed_db": float(psnrs_db(killed[-1].scene, part.val).mean()),
+        "killed_db": float(psnrs_db(killed[-1].scene, *frames).mean()),
         "settled_after_s": float(times_s[-1] - (len(sweep) - 1) / RATE_HZ),
         "versions": len(versions),
         "back_db": max(back),

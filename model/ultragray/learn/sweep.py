@@ -355,6 +355,17 @@ def split_sequence(
     return sweep.select(train), sweep.select(val)
 
 
+def in_recorded_order(dataset: Dataset) -> tuple[ByteArray, FloatArray]:  # [F, H, W], [F, 4, 4] mm
+    """The frames that a data set was recorded as; of one that is split otherwise those to train from."""
+    train, val = dataset.train, dataset.val
+    held_out = np.arange(HELD_OUT_START, len(train) + len(val), HELD_OUT_STEP)
+    if len(held_out) != len(val):
+        return train.images, train.poses
+    others = np.setdiff1d(np.arange(len(train) + len(val)), held_out)
+    order = np.argsort(np.concatenate([others, held_out]))
+    return np.concatenate([train.images, val.images])[order], np.concatenate([train.poses, val.poses])[order]
+
+
 def _chosen(count: int, train_frames: str | None, val_frames: str | None) -> tuple[list[int] | None, list[int] | None]:
     train, val = (
         None if text is None else parse_frame_ranges(text, count, option=option)

@@ -31,6 +31,7 @@ from ultragray.learn.sweep import (
     IntArray,
     Sweep,
     corner_distances_mm,
+    in_recorded_order,
     spread_places,
 )
 from ultragray.learn.training.batch import Batch
@@ -44,6 +45,7 @@ from ultragray.learn.training.intensity import least_sh0, project_sh0
 from ultragray.learn.training.losses import SSIM_WINDOW
 from ultragray.learn.training.memory import training_device
 from ultragray.learn.training.optimizer import Optimizer, Schedule, is_trained
+from ultragray.learn.training.poses import PoseRefinement
 from ultragray.rendering.backends.inputs import spatial_order
 from ultragray.rendering.backends.registry import choose_backend
 from ultragray.rendering.frames import render
@@ -57,6 +59,7 @@ LEAST_FRAMES = 4  # to train from, before anything is shown
 SURVEY_GROWTH = 1.5
 WINDOW_FRAMES = 6  # about each new one, among which it finds its neighbours
 STILL = 0.25  # of the usual spacing: a frame nearer to one that is there already shows no new place
+MOST_AT_ONCE, SMALL_PIXELS = 16_000, 8_000  # Gaussians, and pixels of a frame, of a sweep that is learned in seconds
 RECENT_FRAMES, RECENT_STEPS = 16, 40  # of a new frame, every other is on recent ones; then all are on all frames
 COARSE_STEPS = (60, 20)  # of Gaussians' first: on frames of half the size; of a quarter, which take a third of the time
 COARSE_GAUSSIANS = 0.5  # of the pixels of a frame: with more of them, it is they that take the time
@@ -81,7 +84,7 @@ class GrowingTrainer:
     """The Gaussians of a sweep that is still being recorded, and what trains them."""
 
     def __init__(self, name: str, probe: Probe, *, seed: int = 0, device: str = "cpu", backend: str = "auto") -> None:
-        self.name, self._probe, self._backend = name, probe, backend
+        self.name, self._probe, self._asked, self._backend = name, probe, device, backend
         self._given = TrainingConfig(seed=seed, refine_poses="none")
         self._device = training_device(device, backend)
         self._generator = torch.Generator().manual_seed(seed)
@@ -92,6 +95,7 @@ class GrowingTrainer:
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
         self.judged: dict[int, float] = {}  # PSNR of the newest version shown that was judged by a held-out frame
+        self._whole: PoseRefinement | None = None  # the poses of a sweep that came at once
         self._caution = 1.0  # factor on all rates: less after a version that was worse
 
     @property
@@ -117,7 +121,7 @@ class GrowingTrainer:
         """One step, its rates times `rate`, on recent frames or on all of them in turn; the loss."""
         assert self._train is not None
         train, config = self._train, self._config
-        is_recent = self.step % 2 == 0 and self.step - int(self._born.max()) < RECENT_STEPS
+        is_recent = self._whole is None and self.step % 2 == 0 and self.step - int(self._born.max()) < RECENT_STEPS
         first = max(0, len(train) - RECENT_FRAMES) if is_recent else 0
         own_count = min(config.batch_size - config.batch_size // 2, len(train) - first)
         own = first + torch.randperm(len(train) - first, generator=self._generator)[:own_count]
@@ -161,9 +165,11 @@ class GrowingTrainer:
             training={**self._config.to_dict(), "step": self.step},
             metrics=measured,
             confidence=self._confidence(judgement),
+            tissue_shares=None if self._whole is None else self._whole.tissue_shares,
         )
         splats = {name: tensor.detach().cpu().clone() for name, tensor in self._parameters.items()}
-        return GaussianScene.from_splats(splats, info=info, training_poses=self._train.poses)
+        poses = {"training_poses": self._train.poses} if self._whole is None else self._whole.of_scene()
+        return GaussianScene.from_splats(splats, info=info, **poses)
 
     def judge(self) -> Judgement:
         """Measures the scene on some held-out frames that the version shown was judged by, and on all newer ones."""
@@ -197,6 +203,22 @@ class GrowingTrainer:
     def slow_down(self) -> None:
         """Goes on in smaller steps, until versions are shown again: too large ones show noise."""
         self._caution = max(LEAST_CAUTION, 0.5 * self._caution)
+
+    def anew(self, dataset: Dataset) -> GrowingTrainer:
+        """Another trainer of the same sweep, which is over: of all frames at once, at the poses of the path that they
+        agree with.
+
+        It has few Gaussians, and small frames, so that it takes many steps in seconds: what a scene of noisy frames
+        gains most by is to see each frame often. It is judged by frames of full size, and has no checkpoints.
+        """
+        small = replace(dataset, train=_small(dataset.train), val=_small(dataset.val))
+        whole = PoseRefinement.of(small, "path")
+        other = GrowingTrainer(self.name, self._probe, seed=self._given.seed, device=self._asked, backend=self._backend)
+        other._whole, other.judged = whole, self.judged
+        other.add(*in_recorded_order(whole.dataset))
+        other._held_out = replace(dataset.val, poses=whole.dataset.val.poses)
+        other._info = replace(other._info, image_height=dataset.train.height, image_width=dataset.train.width)
+        return other
 
     def save(self, path: Path) -> None:
         """Writes all that `restore` goes on from, beside the frames themselves."""
@@ -285,6 +307,8 @@ class GrowingTrainer:
             pixels = train.height * train.width
             usual = max(pixels // PIXELS_PER_GAUSSIAN, min(pixels // LEAST_PIXELS, USUAL_GAUSSIANS))
             count = int(moved.sum()) * usual
+            if self._whole is not None:
+                count = min(count, MOST_AT_ONCE)
             if count and len(beside.pairs):
                 config = replace(self._config, initial_gaussians=count, max_gaussians=count)
                 part = Dataset(self.name, train.select(window), train.select([]))
@@ -369,6 +393,17 @@ class GrowingTrainer:
             error=float(np.abs(predicted(weights, terms, black) - reached).mean()),
             fitted_to_mm=float(measures.distance_mm.max()),
         ).to_dict()
+
+
+def _small(sweep: Sweep) -> Sweep:
+    """The frames, each pixel the mean of four, as often as that keeps SMALL_PIXELS and more."""
+    images = sweep.images
+    while True:
+        count, height, width = images.shape
+        if height % 2 or width % 2 or height * width < 4 * SMALL_PIXELS or min(height, width) < 2 * SSIM_WINDOW:
+            return replace(sweep, images=images)
+        fours = images.reshape(count, height // 2, 2, width // 2, 2)
+        images = ((fours.sum(axis=(2, 4), dtype=np.uint16) + 2) // 4).astype(np.uint8)
 
 
 def _joined(before: Sweep | None, added: Sweep) -> Sweep:

@@ -40,6 +40,28 @@ def all_psnr_db(trainer, monkeypatch):
     return trainer.judge().mean_psnr_db
 
 
+def test_a_sweep_that_is_over_is_learned_anew_from_small_frames(sweep, monkeypatch):
+    monkeypatch.setattr(growing, "SMALL_PIXELS", (SIDE // 2) ** 2)
+    monkeypatch.setattr(growing, "MOST_AT_ONCE", 1000)
+    heights, true_render = [], growing.render
+    monkeypatch.setattr(growing, "render", lambda *a, **k: heights.append(k["height"]) or true_render(*a, **k))
+    dataset = Dataset("phantom", *split_sequence(sweep, COUNT, None, None))
+    trainer = grown(sweep, steps=0)
+    trainer.accept(trainer.judge())
+    heights.clear()
+    again = trainer.anew(dataset)
+    at_first = all_psnr_db(again, monkeypatch)
+    for step in range(40):
+        again.take_step(0.1 ** (step / 40))
+    judgement = again.judge()
+    assert set(heights) == {SIDE // 2}
+    assert judgement.mean_psnr_db > at_first + 2.0
+    assert not again.is_worse(judgement)  # than what was shown of the frames as they came
+    scene = again.scene(judgement)
+    assert (scene.info.image_height, scene.gaussian_count) == (SIDE, 1000)
+    assert len(scene.training_poses) == len(dataset.train)
+
+
 def test_it_learns_what_lies_between_its_frames(sweep, monkeypatch):
     train, val = split_sequence(sweep, COUNT, None, None)
     linear = evaluate_baselines(Dataset("phantom", train, val), ("linear",), 1.0)["linear"].mean.psnr_db

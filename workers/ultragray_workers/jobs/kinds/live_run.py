@@ -15,7 +15,7 @@ import numpy as np
 
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.sweep import HELD_OUT_START, HELD_OUT_STEP, ByteArray, Dataset
+from ultragray.learn.sweep import ByteArray, Dataset, in_recorded_order
 from ultragray.learn.training.growing import LOST_DB, GrowingTrainer, Judgement
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 from ultragray.scene.gaussians import GaussianScene
@@ -36,7 +36,7 @@ STEPS_A_VERSION = 4.0  # times as long as it takes to judge and serve one
 POLL_S = 0.1  # while nothing is to be done but to wait for frames
 LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
 PAUSE_STEPS = 150  # after which a sweep that goes no further is learned; they become ever smaller
-SETTLE_S = 16.0  # after the last frame: steps that become ever smaller
+SETTLE_S, LEAST_SETTLE_S = 17.0, 5.0  # after the last frame, for the whole sweep at once; of them steps at least
 MOST_FRAMES = 32  # taken from the recording before the next step
 
 
@@ -95,17 +95,6 @@ class Following:
         return (images[first : self._taken], poses[first : self._taken]) if first < self._taken else None
 
 
-def in_recorded_order(dataset: Dataset) -> tuple[ByteArray, FloatArray]:  # [F, H, W], [F, 4, 4] mm
-    """The frames that a data set was recorded as; of one that is split otherwise those to train from."""
-    train, val = dataset.train, dataset.val
-    held_out = np.arange(HELD_OUT_START, len(train) + len(val), HELD_OUT_STEP)
-    if len(held_out) != len(val):
-        return train.images, train.poses
-    others = np.setdiff1d(np.arange(len(train) + len(val)), held_out)
-    order = np.argsort(np.concatenate([others, held_out]))
-    return np.concatenate([train.images, val.images])[order], np.concatenate([train.poses, val.poses])[order]
-
-
 class _Live:
     """One process at a live job, until the recording is finished and its scene has settled."""
 
@@ -141,16 +130,17 @@ class _Live:
             self._tell()
 
     def settle(self) -> None:
-        """Takes steps that become ever smaller, for a while. Raises Stopped."""
-        if not self.trainer.is_growing:
+        """Learns the whole sweep anew for a while, in steps that become ever smaller. Raises Stopped."""
+        if not self.trainer.is_growing or self.following.dataset is None:
             return
+        end_s = time.monotonic() + SETTLE_S
+        settled = self.trainer.anew(self.following.dataset)
         begun_s = time.monotonic()
-        while (share := (time.monotonic() - begun_s) / SETTLE_S) < 1.0:
-            self._take_step(0.1**share)
-            self._serve_now_and_then()
+        while (share := (time.monotonic() - begun_s) / max(end_s - begun_s, LEAST_SETTLE_S)) < 1.0:
+            settled.take_step(0.1**share)
             self._tell()
+        self.trainer = settled
         self.serve()
-        self._save()
 
     def serve(self) -> None:
         """Serves the scene as it is, unless it has become worse."""
