@@ -130,11 +130,17 @@ class _Live:
             self._tell()
 
     def settle(self) -> None:
-        """Learns the whole sweep anew for a while, in steps that become ever smaller. Raises Stopped."""
-        if not self.trainer.is_growing or self.following.dataset is None:
+        """Learns the whole sweep anew for a while, in steps that become ever smaller. Raises Stopped.
+
+        Nothing where the data set holds out other frames than a recording does: what the trainer judged by is not that.
+        """
+        dataset, trainer = self.following.dataset, self.trainer
+        if not trainer.is_growing or dataset is None or not len(dataset.val):
+            return
+        if trainer.frame_count != len(dataset.train) + len(dataset.val):
             return
         end_s = time.monotonic() + SETTLE_S
-        settled = self.trainer.anew(self.following.dataset)
+        settled = trainer.anew(dataset)
         begun_s = time.monotonic()
         while (share := (time.monotonic() - begun_s) / max(end_s - begun_s, LEAST_SETTLE_S)) < 1.0:
             settled.take_step(0.1**share)
