@@ -80,6 +80,20 @@ def test_no_gaussian_is_missed_far_from_where_it_was(kernel, beam, random_scene,
         assert ((found[name] - expected[name]).abs() < 1e-3).double().mean() > 0.998, name
 
 
+@pytest.mark.parametrize("beam", [None, FOCUSED], ids=["thin", "thick"])
+@pytest.mark.parametrize("kernel", cpu.INSTRUCTION_SETS)
+def test_no_small_gaussian_is_missed_that_goes_another_way_than_its_cluster(kernel, beam, random_scene, random_poses):
+    scene = random_scene(3000, seed=2, extent_cm=(6.0, 6.0, 6.0), sigma_cm=(0.02, 0.04))
+    coefficients = 25.0 * torch.randn((1, 5, 5, 5, 3), generator=torch.Generator().manual_seed(2))
+    moved = scene.under(Displacement.on_grid(coefficients, -60.0, 30.0))
+    poses = random_poses(6, seed=1)
+    expected = drawn("reference", moved.to(torch.float64), LINEAR, poses, beam)["coverage"]
+    off = (drawn(kernel, moved, LINEAR, poses, beam)["coverage"] - expected).abs()
+    lit = expected > 0.01
+    assert lit.sum() > 200
+    assert (off[lit] < 1e-2).double().mean() > 0.995
+
+
 def test_a_field_of_one_value_is_a_probe_that_moved_the_other_way(random_scene, random_poses):
     scene, poses, shift = random_scene(200), random_poses(2), torch.tensor([3.0, -2.0, 4.0])
     shifted = poses.copy()
