@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import BinaryIO, ClassVar, Literal
 
 import numpy as np
 
@@ -420,12 +420,21 @@ class CompressedScenes(Prepared):
         super().__init__(settings, processes)
         self._scenes = scenes
 
-    async def file(self, scene: str) -> Path:
-        """The scene's own file where that is compressed. Raises SceneNotFound, SceneFileInvalid, as `Prepared.path`."""
+    async def open(self, scene: str) -> BinaryIO:
+        """The file, to be read as it is now, whatever removes it meanwhile: the scene's own where that is compressed.
+
+        Raises SceneNotFound, SceneFileInvalid, and as `Prepared.path`.
+        """
         key = await in_own_thread(lambda: self._scenes.sha256(scene))
         header = await in_own_thread(lambda: self._scenes.header(scene))
+        if header.is_compressed:
+            return await asyncio.to_thread(self._scenes.open, scene)
         path = await asyncio.to_thread(self._scenes.path, scene)
-        return path if header.is_compressed else await self.path(key, scene_path=str(path)) / COMPRESSED_NAME
+        folder = await self.path(key, scene_path=str(path))
+        try:
+            return await asyncio.to_thread((folder / COMPRESSED_NAME).open, "rb")
+        except FileNotFoundError:
+            raise ArtifactNotFound("the compressed scene was removed as it was asked for; ask again") from None
 
 
 _FORMAT = 4  # of what is kept of a comparison

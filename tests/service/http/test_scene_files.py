@@ -5,15 +5,17 @@ import hashlib
 import json
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 from safetensors.numpy import load, save
+from starlette.requests import Request
 
 from ultragray import GaussianScene, read_header
 from ultragray_service.core.scene_points import even_selection
-from ultragray_service.http.routes.scenes import OpenFileResponse
+from ultragray_service.http.routes.scenes import OpenFileResponse, download_compressed_scene
 
 from ...waiting import wait_until
 from ...warm import Hold
@@ -237,6 +239,12 @@ def test_corrected_training_poses(http):
     http.delete("/v1/scenes/corrected")
 
 
+async def sent(response):
+    """What a client gets of a response."""
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(response), base_url="http://test") as client:
+        return await client.get("/")
+
+
 def test_a_download_is_of_one_version_whatever_takes_its_name(tmp_path):
     """A scene that grows gets a new version after the length of the one before was told."""
     path, newer = tmp_path / "liver.ugr", tmp_path / "newer.ugr"
@@ -244,13 +252,30 @@ def test_a_download_is_of_one_version_whatever_takes_its_name(tmp_path):
     response = OpenFileResponse(path.open("rb"), filename="liver.ugr")
     newer.write_bytes(b"a shorter one")
     newer.replace(path)
+    answer = asyncio.run(sent(response))
+    assert (answer.content, answer.headers["content-length"]) == (b"the version that was asked for", "30")
+
+
+def test_a_compressed_scene_is_sent_whole_though_it_is_removed_once_found(tmp_path):
+    """Those that were asked for longest ago are removed as others are made."""
+    path = tmp_path / "liver.ugz"
+    path.write_bytes(b"a compressed scene")
+
+    class Compressed:
+        async def open(self, scene):
+            file = path.open("rb")
+            path.unlink()
+            return file
+
+    service = SimpleNamespace(compressed=Compressed(), life=SimpleNamespace(require_serving=lambda: None))
+    request = Request({"type": "http", "headers": []})
 
     async def get():
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(response), base_url="http://test") as client:
-            return await client.get("/")
+        return await sent(await download_compressed_scene(request, service, "liver"))
 
     answer = asyncio.run(get())
-    assert (answer.content, answer.headers["content-length"]) == (b"the version that was asked for", "30")
+    assert (answer.content, answer.headers["content-length"]) == (b"a compressed scene", "18")
+    assert answer.headers["etag"] == f'"{hashlib.sha256(answer.content).hexdigest()}"'
 
 
 def test_a_scene_is_handed_out_compressed_once_made(http, demo_scene, artifacts, tmp_path):

@@ -7,6 +7,7 @@ import base64
 import json
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, BinaryIO
@@ -273,10 +274,10 @@ async def get_thumbnail(request: Request, service: ServiceDep, scene: SceneName)
 class OpenFileResponse(FileResponse):
     """A file that is open already: one version of it, whatever takes its name while a client reads."""
 
-    def __init__(self, file: BinaryIO, *, filename: str) -> None:
+    def __init__(self, file: BinaryIO, *, filename: str, headers: Mapping[str, str] | None = None) -> None:
         self._file = file
         path, status = f"/dev/fd/{file.fileno()}", os.fstat(file.fileno())
-        super().__init__(path, media_type=RAW, filename=filename, stat_result=status)
+        super().__init__(path, headers=headers, media_type=RAW, filename=filename, stat_result=status)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         with self._file:
@@ -302,11 +303,13 @@ async def download_compressed_scene(request: Request, service: ServiceDep, scene
     It is made at the first request.
     """
     service.life.require_serving()
-    path = await service.compressed.file(scene)
-    headers = {"ETag": f'"{await asyncio.to_thread(file_sha256, path)}"', "Cache-Control": "private, no-cache"}
+    file = await service.compressed.open(scene)
+    sha256 = await asyncio.to_thread(file_sha256, f"/dev/fd/{file.fileno()}")
+    headers = {"ETag": f'"{sha256}"', "Cache-Control": "private, no-cache"}
     if is_known(request, headers["ETag"]):
+        file.close()
         return Response(status_code=304, headers=headers)
-    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIXES[True]}", headers=headers)
+    return OpenFileResponse(file, filename=f"{base_name(scene)}{SUFFIXES[True]}", headers=headers)
 
 
 @router.put(
