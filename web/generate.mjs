@@ -8,13 +8,13 @@ import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import openapiTS, { astToString } from "openapi-typescript";
 
 const FOLDER = new URL("src/api/generated/", import.meta.url);
-const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "maxItems", "enum", "const", "examples", "x-numbers"];
+const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "minItems", "maxItems", "enum", "const", "examples", "x-numbers"];
 
 const document = JSON.parse(readFileSync(new URL("openapi.json", import.meta.url), "utf8"));
 const { schemas } = document.components;
 
 /** A JSON schema with its references filled in, as far as a form needs it: see `Described` of web/src/api/described.ts. */
-function described({ $ref, anyOf, oneOf, properties, items, ...schema }) {
+function described({ $ref, anyOf, oneOf, properties, prefixItems, items = prefixItems?.[0], ...schema }) {
   const kept = Object.fromEntries(Object.entries(schema).filter(([key]) => KEPT.includes(key)));
   if (kept.enum) kept.enum = kept.enum.filter((one) => one !== null); // then it is nullable
   if ($ref) return { ...described(schemas[$ref.split("/").at(-1)]), ...kept };
@@ -56,6 +56,8 @@ function operations(paths) {
 
 /** What of a plan is asked for by a form, in its order. */
 const PLANNED = ["want", "within_mm", "views", "path_mm", "region_mm", "label", "box_mm", "tilt_deg", "rock_deg", "turn_deg"];
+/** Of which several edits have one: written once. */
+const shapes = JSON.stringify(described(schemas.InsertEdit.properties.shape).oneOf);
 const contract = (text) => `import type { Described } from "../described";\n\n${text}`;
 /** What every view needs is apart from what only some do, so that the page begins with less. */
 const texts = {
@@ -74,6 +76,9 @@ export const JOB_KINDS: ReadonlyMap<string, Described> = new Map(Object.entries(
 export const trainingSettings: Described = ${JSON.stringify(described(schemas.TrainingConfig), null, 1)};
 export const trainingPresets: Record<string, Record<string, unknown>> = ${JSON.stringify(schemas.TrainingConfig["x-presets"], null, 1)};
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
+`),
+  "edits.ts": contract(`const shapes: Described[] = ${shapes};
+export const edits: Described = ${JSON.stringify(described(schemas.EditBody.properties.edits)).replaceAll(shapes, "shapes")};
 `),
 };
 mkdirSync(FOLDER, { recursive: true });

@@ -98,7 +98,8 @@ function normalised([w, x, y, z]: Quaternion): Quaternion {
   return length === 0 ? [1, 0, 0, 0] : [w / length, x / length, y / length, z / length];
 }
 
-function aboutAxis([x, y, z]: Vector, angle_deg: number): Quaternion {
+/** A turn about an axis of length 1. */
+export function aboutAxis([x, y, z]: Vector, angle_deg: number): Quaternion {
   const half = angle_deg / DEGREES / 2;
   const s = Math.sin(half);
   return [Math.cos(half), x * s, y * s, z * s];

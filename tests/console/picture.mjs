@@ -1,4 +1,4 @@
-/** Draws the documents' pictures of the console, on the demo scene: a steered array, a needle, and Maps. */
+/** Draws the documents' pictures of the console, on the demo scene: a steered array, a needle, a cyst that is put in, and Maps. */
 
 import path from "node:path";
 
@@ -25,6 +25,13 @@ try {
   await changed(tools, first.print);
   await tools.waitForTimeout(SETTLED_MS);
   await tools.screenshot({ path: path.join(PICTURES, "console_tools.png") });
+  const { page: editing } = await openScan({ browser, service }, { scheme: "dark" });
+  for (const panel of ["Confidence", "Image", "Tools", "Pose"]) await editing.getByRole("button", { name: `${panel}: show or hide` }).click();
+  await editing.getByRole("button", { name: "Edit: show or hide" }).click();
+  await editing.getByRole("button", { name: "+ Insert" }).click();
+  await editing.getByRole("combobox", { name: "Tissue" }).selectOption("cyst");
+  await editing.waitForTimeout(SETTLED_MS);
+  await editing.screenshot({ path: path.join(PICTURES, "console_editing.png") });
   const maps = await openPage({ browser, service }, "#/maps/demo");
   await until(() => canvasState(maps, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
   await maps.waitForTimeout(SETTLED_MS);

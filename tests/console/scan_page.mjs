@@ -25,8 +25,11 @@ export async function enterPose(page, text) {
   await page.keyboard.press("Enter");
 }
 
-/** Drags the probe by a handle, which the pointer tells by its shape, until the pose follows; false without a handle. */
-export async function dragProbe(page, room, pose) {
+/** Drags the probe by a handle, which the pointer tells by its shape, until the pose follows; false without a handle.
+ *
+ * `read`: what follows in place of the pose.
+ */
+export async function dragProbe(page, room, pose, read = poseOf) {
   const box = await room.boundingBox();
   for (let y = 0.25; y < 0.6; y += 0.015) {
     for (let x = 0.45; x < 0.75; x += 0.015) {
@@ -36,7 +39,7 @@ export async function dragProbe(page, room, pose) {
       await page.mouse.move(box.x + box.width * x + 30, box.y + box.height * y + 40, { steps: 4 });
       await page.mouse.up();
       const moved = (now) => JSON.stringify(now) !== JSON.stringify(pose);
-      await until(() => poseOf(page), moved, "the probe did not follow the pointer");
+      await until(() => read(page), moved, "the probe did not follow the pointer");
       return true;
     }
   }

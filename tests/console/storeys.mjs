@@ -13,7 +13,7 @@ const STOREYS = [
   ["page"],
   ["shared"],
   ["session"],
-  ["space", "tools", "locate", "plan", "labels", "registrations", "connect", "jobs"],
+  ["space", "tools", "locate", "plan", "labels", "edit", "registrations", "connect", "jobs"],
   ["scan", "maps", "compare", "train", "scenes"],
   ["shell"],
   ["main.ts"],

@@ -154,7 +154,11 @@ class TubeShape(Shape):
     """All that lies near a path of straight pieces, such as a vessel."""
 
     points_mm: tuple[tuple[float, float, float], ...] = described(
-        "The path, two points or more.", low=-MAX_POSITION_MM, high=MAX_POSITION_MM, most=MAX_TUBE_POINTS
+        "The path, two points or more.",
+        low=-MAX_POSITION_MM,
+        high=MAX_POSITION_MM,
+        most=MAX_TUBE_POINTS,
+        schema={"items": {"type": "array", "prefixItems": [{"type": "number"}] * 3, "minItems": 3, "maxItems": 3}},
     )
     radius_mm: float = _size_field("Its radius.")
     kind: Literal["tube"] = kind_field("tube")

@@ -20,7 +20,7 @@ const RETRY_MS = 2000;
 const PASSING = [429, 502, 503, 504]; // full or starting; proxies answer 502 and 504 while the service starts anew
 
 /** What the service answers in place of a result. */
-export type Problem = Pick<Schemas["Problem"], "status" | "detail" | "reason"> & { components?: Schemas["Components"] };
+export type Problem = Pick<Schemas["Problem"], "status" | "detail" | "reason"> & Partial<Pick<Schemas["Problem"], "field">> & { components?: Schemas["Components"] };
 
 /** The service refused. */
 export class ServiceError extends Error {

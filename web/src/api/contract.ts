@@ -4,7 +4,7 @@
  */
 
 import { postJson, type Schemas } from "./client";
-import { defaultsOf, type Described } from "./described";
+import { defaultsOf, type Described, membersOf } from "./described";
 import { namedProbes, outputs, settings } from "./generated/contract";
 
 export type StreamSettings = Omit<Schemas["RenderSettings"], "encoding">;
@@ -45,9 +45,7 @@ export type Probe = NonNullable<Schemas["DatasetRecord"]["probe"]>;
 export type ImagePlane = Schemas["ImagePlane"];
 
 /** The numbers that a probe of each kind is made of. */
-export const PROBE_KINDS: ReadonlyMap<string, Described> = new Map(
-  (settings.properties?.probe?.oneOf ?? []).map((one) => [String(one.properties?.kind?.const), one]),
-);
+export const PROBE_KINDS = membersOf<string>(settings.properties!.probe!);
 
 /** Probes as makers call them, such as L12-4. */
 export const NAMED_PROBES = namedProbes as Record<string, Probe>;
@@ -66,9 +64,7 @@ export type ToolKind = Tool["kind"];
 export type ToolFrame = Tool["frame"];
 
 /** What a tool of each kind is made of. */
-export const TOOL_KINDS: ReadonlyMap<ToolKind, Described> = new Map(
-  settings.properties!.tools!.items!.oneOf!.map((one) => [one.properties!.kind!.const as ToolKind, one]),
-);
+export const TOOL_KINDS = membersOf<ToolKind>(settings.properties!.tools!.items!);
 /** Of one frame. */
 export const MOST_TOOLS = settings.properties!.tools!.maxItems!;
 export const TOOL_FRAMES = TOOL_KINDS.get("needle")!.properties!.frame!.enum as ToolFrame[];

@@ -11,6 +11,7 @@ export interface Described {
   minimum?: number;
   exclusiveMinimum?: number;
   maximum?: number;
+  minItems?: number;
   maxItems?: number;
   enum?: string[];
   const?: string;
@@ -22,7 +23,7 @@ export interface Described {
 }
 
 const UNUSUAL: Record<string, string> = { bmode: "B-mode", tgc: "TGC", val: "held-out" };
-const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms", gb: "GB" };
+const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", mhz: "MHz", s: "s", ms: "ms", gb: "GB" };
 
 /** The name of a field as people read it, and its unit, by which the name ends. */
 export function labelOf(name: string): { label: string; unit: string } {
@@ -38,9 +39,19 @@ export function defaultsOf({ properties = {} }: Described): Record<string, unkno
   return Object.fromEntries(Object.entries(properties).map(([name, field]) => [name, field.default]));
 }
 
+/** The members of a closed set, by the kind that tells them apart. */
+export function membersOf<Kind extends string>({ oneOf = [] }: Described): ReadonlyMap<Kind, Described> {
+  return new Map(oneOf.map((one) => [one.properties!.kind!.const as Kind, one]));
+}
+
 /** Whether one input is enough for a value. */
 export function isSimple({ type, enum: choices }: Described): boolean {
   return choices !== undefined || ["number", "integer", "boolean", "string"].includes(type ?? "");
+}
+
+/** Whether a value is a place, a direction or an extent: three numbers. */
+export function isVector({ type, items, minItems, maxItems }: Described): boolean {
+  return type === "array" && items?.type === "number" && minItems === 3 && maxItems === 3;
 }
 
 /** Whether a value is a list of words, which a person writes with commas between them. */

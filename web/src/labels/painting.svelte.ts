@@ -54,7 +54,7 @@ export class Painting {
     const known = session.scene.description?.label_names ?? {};
     this.names = Object.keys(known).length > 0 ? known : { 1: words.labels.first };
     this.chosen = Number(Object.keys(this.names)[0]);
-    this.into = freeName(session.name);
+    this.into = service.freeName(session.name, "labelled");
   }
 
   /** Adds a label, which is then painted with. */
@@ -226,16 +226,6 @@ export class Painting {
 }
 
 const poseOf = ({ header }: Frame): Pose => header.pose.flat();
-
-/** liver: liver-labelled; the next one that is free where that is there. */
-function freeName(scene: string): string {
-  const base = `${scene.replace(/-labelled(-\d+)?$/, "")}-labelled`;
-  const taken = new Set(service.scenes.map(({ name }) => name));
-  for (let number = 1; ; number++) {
-    const name = number === 1 ? base : `${base}-${number}`;
-    if (!taken.has(name)) return name;
-  }
-}
 
 /** What is painted in a session; the same each time that it is shown. */
 export const paintingOf = besideSession((session) => new Painting(session));

@@ -240,6 +240,16 @@ class ServiceState {
     return allowed && words.shell.key.allowed(allowed.roles, allowed.owner);
   }
 
+  /** liver: liver-edited; the next one that is free where that is there. */
+  freeName(scene: string, ending: string): string {
+    const base = `${scene.replace(new RegExp(`-${ending}(-\\d+)?$`), "")}-${ending}`;
+    const taken = new Set(this.scenes.map(({ name }) => name));
+    for (let number = 1; ; number++) {
+      const name = number === 1 ? base : `${base}-${number}`;
+      if (!taken.has(name)) return name;
+    }
+  }
+
   /** Has what was kept of a scene let go where it is gone. */
   whenGone(forget: (scene: string) => void): void {
     this.#forgetting.push(forget);

@@ -9,7 +9,7 @@ import type { Store } from "./store.svelte";
 const STORAGE = "ultragray.scan";
 export const SPEEDS = [0.25, 0.5, 1, 2, 4] as const;
 /** Groups that are closed until a person opens them. */
-const SELDOM = ["locate", "plan", "labels", "registrations", "cases"];
+const SELDOM = ["locate", "plan", "labels", "edit", "registrations", "cases"];
 
 /** How a person likes the Scan view, kept by the browser. */
 class ScanSettings {

@@ -1,8 +1,8 @@
 /** One scene as it is scanned: the probe, where it is held, how its frames are shown, which tools are in them, and what can be undone. */
 
 import {
-  AS_RENDERED, AS_TRAINED, type Display, exampleTool, type ImagePlane, MOST_TOOLS, type Output,
-  type PlainSettings, type Probe, type StreamSettings, type Tool, type ToolKind,
+  AS_RENDERED, AS_TRAINED, type Display, type ImagePlane, MOST_TOOLS, type Output,
+  type PlainSettings, type Probe, type StreamSettings, type Tool,
 } from "../api/contract";
 import { squarePixel_mm } from "../geometry/plane";
 import {
@@ -148,43 +148,49 @@ export class ImageSettings {
   }
 }
 
-/** The tools in the image of a session, and which of them is worked on. */
-export class Tools {
-  all = $state.raw<readonly Tool[]>([]);
+/** Things of a session, and which of them is worked on; their changes are steps that can be undone. */
+export class WorkList<T> {
+  all = $state.raw<readonly T[]>([]);
   #chosen = $state(0);
   readonly chosen = $derived.by(() => Math.min(this.#chosen, this.all.length - 1));
-  readonly current = $derived.by<Tool | null>(() => this.all[this.chosen] ?? null);
-  readonly isFull = $derived.by(() => this.all.length >= MOST_TOOLS);
+  readonly current = $derived.by<T | null>(() => this.all[this.chosen] ?? null);
+  readonly isFull = $derived.by(() => this.all.length >= this.most);
 
-  constructor(private readonly history: History) {}
+  constructor(
+    private readonly history: History,
+    private readonly what: string,
+    private readonly most: number,
+  ) {}
 
   choose(index: number): void {
     this.#chosen = index;
   }
 
-  /** Adds one, which is then worked on. `placed` puts it somewhere. */
-  add(kind: ToolKind, placed: (tool: Tool) => Tool): void {
-    this.#change([...this.all, placed(exampleTool(kind))]);
+  /** Adds one, which is then worked on. */
+  add(one: T): void {
+    this.#change([...this.all, one]);
     this.#chosen = this.all.length - 1;
   }
 
   /** Puts a changed one in the place of that which is worked on. */
-  change(tool: Tool): void {
-    this.#change(this.all.map((before, index) => (index === this.chosen ? tool : before)), `tool ${this.chosen}`);
+  change(changed: T): void {
+    this.#change(this.all.map((before, index) => (index === this.chosen ? changed : before)), `${this.what} ${this.chosen}`);
   }
 
-  removeChosen(): void {
-    this.#change(this.all.filter((_, index) => index !== this.chosen));
+  remove(index: number): void {
+    const before = this.chosen;
+    this.#change(this.all.filter((_, other) => other !== index));
+    if (index < before) this.#chosen = before - 1;
   }
 
   /** Takes all of them from elsewhere; not a step that can be undone. */
-  take(all: readonly Tool[]): void {
+  take(all: readonly T[]): void {
     this.all = all;
     this.#chosen = 0;
   }
 
   /** Changes of one `run` are one step. */
-  #change(all: readonly Tool[], run: string | null = null): void {
+  #change(all: readonly T[], run: string | null = null): void {
     this.history.change((put) => (this.all = put), this.all, all, { run });
     this.all = all;
   }
@@ -208,7 +214,7 @@ export class Session {
   jumps = $state(0);
   readonly history = new History();
   readonly image = new ImageSettings();
-  readonly tools = new Tools(this.history);
+  readonly tools = new WorkList<Tool>(this.history, "tool", MOST_TOOLS);
   /** What is played in place of the training sweep. */
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */

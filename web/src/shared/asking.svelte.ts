@@ -2,7 +2,7 @@
 
 import { SvelteSet } from "svelte/reactivity";
 
-import { explain, pauseAfter } from "../api/client";
+import { explain, pauseAfter, ServiceError } from "../api/client";
 import type { Told } from "../api/datasets";
 import type { ViewName } from "../page/router.svelte";
 
@@ -84,6 +84,8 @@ export class Polled<Answer> {
 export class Attempt {
   busy = $state(false);
   problem = $state<string | null>(null);
+  /** Of what was sent, the value to blame for that. */
+  field = $state<string | null>(null);
   #ending = new AbortController();
 
   /** Tries it, in place of what is still tried; false where it came to nothing, or was stopped. */
@@ -91,12 +93,14 @@ export class Attempt {
     this.stop();
     const { signal } = (this.#ending = new AbortController());
     this.busy = true;
-    this.problem = null;
+    this.problem = this.field = null;
     try {
       await work(signal);
       return true;
     } catch (error) {
-      if (!signal.aborted) this.problem = explain(error);
+      if (signal.aborted) return false;
+      this.problem = explain(error);
+      this.field = (error instanceof ServiceError && error.problem.field) || null;
       return false;
     } finally {
       if (!signal.aborted) this.busy = false;

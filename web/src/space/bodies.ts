@@ -9,7 +9,8 @@ import {
 import type { ImagePlane, Tool } from "../api/contract";
 import { type Frame, outputPixels } from "../api/stream";
 import { areAllAround, boxOf, type Line, pixelAt, type Placed, shortened } from "../geometry/plane";
-import type { Pose } from "../geometry/pose";
+import { length, minus, type Pose, type Vector } from "../geometry/pose";
+import { middleOf, poseOfEllipsoid, type Solid } from "../geometry/shapes";
 import type { Skin } from "../geometry/skin";
 import { isRod, lengthOf, poseOfBox } from "../geometry/tool_place";
 import { type Box, corners } from "./appearance";
@@ -310,10 +311,14 @@ function bodyOf(tool: Tool): Group {
     placeObject(body, poseOfBox(tool));
     return body;
   }
-  const [tip, hub] = [new Vector3(...tool.tip_mm), new Vector3(...tool.hub_mm)];
-  body.position.copy(tip).add(hub).divideScalar(2);
-  body.quaternion.setFromUnitVectors(UP, hub.sub(tip).normalize());
+  placeRod(body, tool.tip_mm, tool.hub_mm);
   return body;
+}
+
+function placeRod(rod: Object3D, from_mm: Vector, to_mm: Vector): void {
+  const [from, to] = [new Vector3(...from_mm), new Vector3(...to_mm)];
+  rod.position.copy(from).add(to).divideScalar(2);
+  rod.quaternion.setFromUnitVectors(UP, to.sub(from).normalize());
 }
 
 function rodGeometry(length_mm: number, diameter_mm: number): CylinderGeometry {
@@ -328,4 +333,55 @@ function partsOf(geometry: BufferGeometry): [Mesh, Mesh] {
   const trace = new Mesh(geometry, new MeshBasicMaterial({ color: TOOL_COLOUR, ...seenThrough }));
   trace.renderOrder = TRACE.order;
   return [solid, trace];
+}
+
+const SOLID_COLOURS = { held: 0xffd60a, other: 0xb09a3c };
+
+/** Shapes of edits, pale, and seen through what is before them; `held`: the one that is worked on. */
+export function solidBodies(solids: readonly Solid[], held: Solid | null): Group {
+  const bodies = new Group();
+  for (const solid of solids) {
+    const color = solid === held ? SOLID_COLOURS.held : SOLID_COLOURS.other;
+    for (const part of partsOfSolid(solid)) {
+      part.material = new MeshLambertMaterial({ color, transparent: true, opacity: TRACE.opacity, depthTest: false, depthWrite: false });
+      part.renderOrder = TRACE.order;
+      bodies.add(part);
+    }
+  }
+  return bodies;
+}
+
+function partsOfSolid(solid: Solid): Mesh[] {
+  switch (solid.kind) {
+    case "sphere":
+      return [ball(solid.centre_mm, solid.radius_mm)];
+    case "ellipsoid": {
+      const body = ball(solid.centre_mm, 1);
+      placeObject(body, poseOfEllipsoid(solid));
+      body.scale.set(...solid.radii_mm);
+      return [body];
+    }
+    case "box": {
+      const [low, high] = [solid.min_mm, solid.max_mm];
+      const body = new Mesh(new BoxGeometry(high[0] - low[0], high[1] - low[1], high[2] - low[2]));
+      body.position.set(...middleOf(solid));
+      return [body];
+    }
+    case "tube": {
+      const { points_mm, radius_mm } = solid;
+      const pieces = points_mm.slice(1).map((to, index) => {
+        const from = points_mm[index]!;
+        const piece = new Mesh(rodGeometry(length(minus(to, from)), 2 * radius_mm));
+        placeRod(piece, from, to);
+        return piece;
+      });
+      return [...pieces, ...points_mm.map((point) => ball(point, radius_mm))];
+    }
+  }
+}
+
+function ball(centre_mm: Vector, radius_mm: number): Mesh {
+  const body = new Mesh(new SphereGeometry(radius_mm, 2 * SIDES, SIDES));
+  body.position.set(...centre_mm);
+  return body;
 }

@@ -1,10 +1,10 @@
-/** The probe in space: a body that is dragged over the skin, and a gizmo that moves and turns it. */
+/** What is dragged in space: the probe, over the skin and by a gizmo that moves and turns it, and a point by a gizmo. */
 
-import { type Camera, Group, type Intersection, Mesh, Plane, Raycaster, Vector2, Vector3 } from "three";
+import { type Camera, Group, type Intersection, Mesh, type Object3D, Plane, Raycaster, Vector2, Vector3 } from "three";
 import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
 
 import type { ImagePlane } from "../api/contract";
-import { axis, dot, fromPositionQuaternion, IDENTITY, minus, type Pose, position, translated } from "../geometry/pose";
+import { axis, dot, fromPositionQuaternion, IDENTITY, minus, type Pose, position, translated, type Vector } from "../geometry/pose";
 import { drop, placeObject, probeBody } from "./bodies";
 import { OCCLUDERS } from "./cloud";
 
@@ -24,12 +24,54 @@ export type Gizmo = "translate" | "rotate" | "none";
 
 const LEAST_SLOPE = 0.25; // of the line of sight to the plane that the body slides in; below, it slides across the view
 
-interface Events {
+interface Events<Place> {
   changed: () => void;
-  /** Whether the probe is dragged now. */
+  /** Whether it is dragged now. */
   handled: (now: boolean) => void;
   /** Where it is dragged to. */
-  moved: (pose: Pose) => void;
+  moved: (to: Place) => void;
+}
+
+const GIZMO_SIZE = 0.7;
+
+function gizmoOf(object: Object3D, camera: Camera, element: HTMLElement, { changed, handled }: Events<never>): TransformControls {
+  const gizmo = new TransformControls(camera, element);
+  gizmo.size = GIZMO_SIZE;
+  gizmo.attach(object);
+  gizmo.addEventListener("change", changed);
+  gizmo.addEventListener("dragging-changed", ({ value }) => handled(value === true));
+  return gizmo;
+}
+
+function show(gizmo: TransformControls, isShown: boolean): void {
+  gizmo.enabled = gizmo.getHelper().visible = isShown;
+}
+
+/** A point with a gizmo that moves it along the axes of the scene. */
+export class PointHandle {
+  readonly object = new Group();
+  readonly #gizmo: TransformControls;
+
+  constructor(camera: Camera, element: HTMLElement, events: Events<Vector>) {
+    this.#gizmo = gizmoOf(this.object, camera, element, events);
+    this.#gizmo.addEventListener("objectChange", () => events.moved(this.object.position.toArray()));
+    this.#gizmo.addEventListener("axis-changed", ({ value }) => (element.style.cursor = value === null ? "" : "grab"));
+    this.put(null);
+  }
+
+  get helper(): Object3D {
+    return this.#gizmo.getHelper();
+  }
+
+  /** null: there is none. */
+  put(point: Vector | null): void {
+    show(this.#gizmo, point !== null);
+    if (point !== null && !this.#gizmo.dragging) this.object.position.set(...point); // else the pointer has it
+  }
+
+  dispose(): void {
+    this.#gizmo.dispose();
+  }
 }
 
 export class ProbeHandle {
@@ -45,14 +87,10 @@ export class ProbeHandle {
   constructor(
     private readonly camera: Camera,
     private readonly element: HTMLElement,
-    private readonly events: Events,
+    private readonly events: Events<Pose>,
   ) {
-    this.#gizmo = new TransformControls(camera, element);
+    this.#gizmo = gizmoOf(this.object, camera, element, events);
     this.#gizmo.space = "local";
-    this.#gizmo.size = 0.7;
-    this.#gizmo.attach(this.object);
-    this.#gizmo.addEventListener("change", events.changed);
-    this.#gizmo.addEventListener("dragging-changed", ({ value }) => events.handled(value === true));
     this.#gizmo.addEventListener("objectChange", () => this.#report(this.#gizmo.axis?.includes("Z") ?? false));
     // before the controls of the view, which lie on the same element
     element.parentElement!.addEventListener("pointerdown", this.#take, { capture: true });
@@ -61,15 +99,15 @@ export class ProbeHandle {
     element.addEventListener("pointercancel", this.#letGo);
   }
 
-  get helper(): ReturnType<TransformControls["getHelper"]> {
+  get helper(): Object3D {
     return this.#gizmo.getHelper();
   }
 
   setGizmo(gizmo: Gizmo): void {
     this.#held = gizmo !== "none";
     if (gizmo !== "none") this.#gizmo.setMode(gizmo);
-    this.#gizmo.enabled = this.#held;
-    this.helper.visible = this.#held;
+    else this.element.style.cursor = "";
+    show(this.#gizmo, this.#held);
   }
 
   setProbe(plane: ImagePlane): void {
@@ -111,8 +149,8 @@ export class ProbeHandle {
 
   /** The pointer tells what can be dragged. */
   #tell(event: PointerEvent): void {
-    const over = this.#held && this.#gizmo.axis === null && this.#hit(pointedAt(event, this.camera)) !== undefined;
-    this.element.style.cursor = this.#held && this.#gizmo.axis !== null ? "grab" : over ? "move" : "";
+    const over = this.#gizmo.axis === null && this.#hit(pointedAt(event, this.camera)) !== undefined;
+    this.element.style.cursor = this.#gizmo.axis !== null ? "grab" : over ? "move" : "";
   }
 
   #take = (event: PointerEvent): void => {
@@ -135,7 +173,7 @@ export class ProbeHandle {
   };
 
   #drag = (event: PointerEvent): void => {
-    if (this.#taken === null && event.buttons === 0) this.#tell(event);
+    if (this.#held && this.#taken === null && event.buttons === 0) this.#tell(event);
     if (this.#taken?.pointer !== event.pointerId) return;
     const at = pointedAt(event, this.camera).ray.intersectPlane(this.#taken.plane, new Vector3());
     if (at === null) return;

@@ -11,14 +11,15 @@ import type { Gaussians } from "../api/gaussians";
 import type { Frame } from "../api/stream";
 import type { Placed } from "../geometry/plane";
 import { apply, axis, IDENTITY, length, minus, type Pose, type Vector } from "../geometry/pose";
+import { middleOf, type Solid } from "../geometry/shapes";
 import type { Skin } from "../geometry/skin";
 import {
   type Appearance, type Box, type Cut, type CutAcross, type Form, type Look, lookFrom, type Sides,
   type Viewpoint,
 } from "./appearance";
-import { boxLines, drop, LiveImage, plannedViews, skinMesh, sweepPlanes, ToolBodies } from "./bodies";
+import { boxLines, drop, LiveImage, plannedViews, skinMesh, solidBodies, sweepPlanes, ToolBodies } from "./bodies";
 import { Cloud, OCCLUDERS, type Sight } from "./cloud";
-import { type Gizmo, pointedAt, ProbeHandle } from "./probe_handle";
+import { type Gizmo, pointedAt, PointHandle, ProbeHandle } from "./probe_handle";
 import type { Volume } from "./volume";
 
 const BUSY_SHARE = 0.3; // of the time, at most, goes into drawing what the live image changes: it comes first itself
@@ -266,6 +267,8 @@ const BACKGROUND = 0x12161b; // --space of styles.css
 interface Events {
   /** The person drags the probe to a pose. */
   moved: (pose: Pose) => void;
+  /** The person drags the shape that is worked on to a place. */
+  put: (place: Vector) => void;
   /** The person looks from somewhere else. */
   looked: (look: Look) => void;
   /** The person points twice at a place on the skin. */
@@ -279,6 +282,7 @@ export class SpaceView {
   #loop: DrawingLoop;
   #eye: Eye;
   #probe: ProbeHandle;
+  #point: PointHandle;
   #image = new LiveImage();
   #imagePose: Pose | null = null;
   #tools = new ToolBodies();
@@ -291,6 +295,7 @@ export class SpaceView {
   #outline: LineSegments | null = null;
   #skin: Mesh | null = null;
   #plan: LineSegments | null = null;
+  #solids: Group | null = null;
   /** Whether the person has put the eye where it is. */
   #steers = false;
 
@@ -315,14 +320,13 @@ export class SpaceView {
       },
       handled: (now) => (this.#loop.handled = now),
     });
-    this.#probe = new ProbeHandle(this.#eye.camera, domElement, {
-      changed: this.#acted,
-      moved: (pose) => this.events.moved(pose),
-      handled: (now) => {
-        this.#loop.handled = now;
-        this.#eye.enabled = !now;
-      },
-    });
+    const handled = (now: boolean): void => {
+      this.#loop.handled = now;
+      this.#eye.enabled = !now;
+    };
+    const dragged = { changed: this.#acted, handled };
+    this.#probe = new ProbeHandle(this.#eye.camera, domElement, { ...dragged, moved: (pose) => this.events.moved(pose) });
+    this.#point = new PointHandle(this.#eye.camera, domElement, { ...dragged, moved: (place) => this.events.put(place) });
     this.#image.object.layers.enable(OCCLUDERS);
     const light = new DirectionalLight(0xffffff, 1.8);
     light.position.set(-0.5, 1, 1);
@@ -330,17 +334,18 @@ export class SpaceView {
     this.#scene.background = new Color(BACKGROUND);
     const lit = [new AmbientLight(0xffffff, 1.2), this.#eye.camera];
     this.#scene.add(...lit, this.#probe.object, this.#probe.helper, this.#image.object);
-    this.#scene.add(this.#tools.object, this.#cloud.object);
+    this.#scene.add(this.#tools.object, this.#cloud.object, this.#point.object, this.#point.helper);
   }
 
   dispose(): void {
     this.#loop.stop();
     this.#probe.dispose();
+    this.#point.dispose();
     this.#eye.dispose();
     this.#cloud.dispose();
     this.#image.dispose();
     this.#tools.dispose();
-    for (const object of [this.#sweep, this.#outline, this.#skin, this.#plan]) if (object) drop(object);
+    for (const object of [this.#sweep, this.#outline, this.#skin, this.#plan, this.#solids]) if (object) drop(object);
     this.#renderer.domElement.removeEventListener("webglcontextrestored", this.#restored);
     this.#renderer.dispose();
     this.#renderer.domElement.remove();
@@ -381,6 +386,15 @@ export class SpaceView {
     if (this.#plan) drop(this.#plan);
     this.#plan = plane && plannedViews(views, plane);
     if (this.#plan) this.#scene.add(this.#plan);
+    this.#acted();
+  }
+
+  /** Shapes of edits, and the one that is worked on; `isDragged`: whether a gizmo moves that. */
+  setSolids(solids: readonly Solid[], held: Solid | null, isDragged: boolean): void {
+    if (this.#solids) drop(this.#solids);
+    this.#solids = solidBodies(solids, held);
+    this.#scene.add(this.#solids);
+    this.#point.put(isDragged && held !== null ? middleOf(held) : null);
     this.#acted();
   }
 

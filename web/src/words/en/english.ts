@@ -240,6 +240,10 @@ const sentences = {
     },
     open: (scene: string): string => `Open ${scene}`,
   },
+  edit: {
+    gone: (scene: string): string => `${scene} (not here any more)`,
+    remove: (number: number): string => `Remove edit ${number}`,
+  },
   plan: {
     found: (count: number, before: string, after: string, path_mm: string): string =>
       `${count} views, ${before} → ${after}, ${path_mm} mm of way`,
