@@ -2,7 +2,7 @@
 
 import json
 import threading
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 
 import httpx
 import pytest
