@@ -86,7 +86,7 @@ def test_completion_knows_commands_and_options():
         program = "from ultragray_service.cli.app import app; app(prog_name='ultragray')"
         return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
 
-    assert completed("ultragray re").split() == ["render", "registrations", "restore", "report"]
+    assert completed("ultragray re").split() == ["render", "recordings", "registrations", "restore", "report"]
     assert "--outputs" in completed("ultragray render --out").split()
 
 

@@ -113,10 +113,10 @@ def test_clocks_are_aligned_by_the_messages_that_come_anyway(open_stream):
         arrived_ms = client_ms()
         stamps = {"answer_sent_ms": about["sent_ms"], "answer_arrived_ms": arrived_ms, "sent_ms": client_ms()}
         about, _ = stream.ask(pose=at(0.0), client_time_ms=client_ms() - 250.0, clock=stamps)
-    assert abs(about["clock"]["offset_ms"] - ahead_ms) <= about["clock"]["uncertainty_ms"] + 50.0
     assert about["age_ms"] + about["clock"]["uncertainty_ms"] >= 250.0
     stream.send(pose={"matrix": [[1.0]]})
-    assert stream.receive()[0]["clock"]["offset_ms"] == pytest.approx(ahead_ms, abs=100.0)
+    for clock in (about["clock"], stream.receive()[0]["clock"]):
+        assert abs(clock["offset_ms"] - ahead_ms) <= clock["uncertainty_ms"] + 50.0
 
 
 def test_late_real_frames_correct_what_the_scene_shows_at_present(open_stream):
