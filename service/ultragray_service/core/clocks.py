@@ -15,6 +15,7 @@ and a line in time, offset and drift, is fitted to those of the last minute: eac
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -63,12 +64,31 @@ class _RoundTrip(NamedTuple):
     took_s: float
 
 
+class _Line(NamedTuple):
+    """The client's clock beside the service's, as far as it is known: a line in time, through the newest round trip."""
+
+    at_s: float  # of the service
+    offset_s: float  # then
+    drift: float
+    least_s: float  # the fastest round trip
+    variance: float  # of the offset then, s²
+    covariance: float  # of offset and drift, s
+    drift_variance: float
+
+    def offset(self, at_s: float) -> tuple[float, float]:
+        """The offset at a time, and its uncertainty, in seconds."""
+        later_s = at_s - self.at_s
+        variance = self.variance + later_s * (2.0 * self.covariance + later_s * self.drift_variance)
+        return self.offset_s + later_s * self.drift, self.least_s / 2.0 + math.sqrt(variance)
+
+
 class ClientClock:
     """The clock of one client, of which nothing is known at first."""
 
     def __init__(self) -> None:
         self._trips: deque[_RoundTrip] = deque(maxlen=_KEPT)
         self._best_since_s = 0.0
+        self._line: _Line | None = None  # of these round trips
 
     def observe(self, stamps: ClockStamps, arrived_s: float) -> None:
         """Takes the stamps of a message, and when it arrived here. What cannot be is left out."""
@@ -78,8 +98,8 @@ class ClientClock:
             return
         offset_s = (stamps.answer_arrived_s - stamps.answer_sent_s + stamps.sent_s - arrived_s) / 2.0
         trip = _RoundTrip(arrived_s - (took_s + waited_s) / 2.0, offset_s, took_s)
-        if self._trips:
-            expected_s, uncertainty_s, _ = self._fitted(trip.at_s)
+        if self._line is not None:
+            expected_s, uncertainty_s = self._line.offset(trip.at_s)
             if abs(offset_s - expected_s) > took_s / 2.0 + uncertainty_s + _SLACK_S:
                 self._trips.clear()
         if not self._trips or trip.at_s - self._best_since_s >= _BETWEEN_S:
@@ -87,21 +107,27 @@ class ClientClock:
             self._best_since_s = trip.at_s
         elif trip.took_s < self._trips[-1].took_s:
             self._trips[-1] = trip
+        else:
+            return
+        self._line = _fitted(self._trips)
 
     def offset(self, at_s: float) -> ClockOffset | None:
         """The offset at a time of the service; None: no round trip is known yet."""
-        if not self._trips:
+        if self._line is None:
             return None
-        offset_s, uncertainty_s, drift = self._fitted(at_s)
-        return ClockOffset(round(1e3 * offset_s, 3), round(1e3 * uncertainty_s, 3), round(1e6 * drift, 1))
+        offset_s, uncertainty_s = self._line.offset(at_s)
+        return ClockOffset(round(1e3 * offset_s, 3), round(1e3 * uncertainty_s, 3), round(1e6 * self._line.drift, 1))
 
-    def _fitted(self, at_s: float) -> tuple[float, float, float]:
-        """Offset and its uncertainty at a time, s, and the drift: weighted least squares, no drift being likely."""
-        times_s, offsets_s, took_s = np.array(self._trips).T
-        least_s, first_s = took_s.min(), offsets_s[-1]
-        weights = ((took_s - least_s) / 2.0 + _RESOLUTION_S) ** -2.0
-        columns = np.stack([np.ones_like(times_s), times_s - at_s], axis=1)
-        normal = (weights * columns.T) @ columns + np.diag([0.0, _USUAL_DRIFT**-2])
-        covariance = np.linalg.inv(normal)
-        offset_s, drift = covariance @ (weights * columns.T) @ (offsets_s - first_s)  # small numbers of large ones
-        return float(first_s + offset_s), float(least_s / 2.0 + np.sqrt(covariance[0, 0])), float(drift)
+
+def _fitted(trips: deque[_RoundTrip]) -> _Line:
+    """Weighted least squares, no drift being likely."""
+    times_s, offsets_s, took_s = np.array(trips).T
+    least_s, first_s = took_s.min(), offsets_s[-1]
+    weights = ((took_s - least_s) / 2.0 + _RESOLUTION_S) ** -2.0
+    columns = np.stack([np.ones_like(times_s), times_s - times_s[-1]], axis=1)
+    normal = (weights * columns.T) @ columns + np.diag([0.0, _USUAL_DRIFT**-2])
+    inverse = np.linalg.inv(normal)
+    offset_s, drift = inverse @ (weights * columns.T) @ (offsets_s - first_s)  # small numbers of large ones
+    (variance, covariance), (_, drift_variance) = inverse
+    found = times_s[-1], first_s + offset_s, drift, least_s, variance, covariance, drift_variance
+    return _Line(*map(float, found))
