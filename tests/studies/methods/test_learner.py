@@ -1,10 +1,15 @@
 """Fits of learned methods within their budgets: interrupted ones end as undisturbed ones."""
 
+import time
+from itertools import count
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from ultragray.errors import InvalidArgument, TrainingDiverged, TrainingStateInvalid
+from ultragray_studies.methods import learner
 from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE, without_subnormals
 from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
 
@@ -61,9 +66,11 @@ def test_a_finished_fit_is_found_in_its_folder(mean_image, make_dataset, tmp_pat
 
 
 @pytest.mark.parametrize("folder", [None, "fit"])
-def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(folder, mean_image, make_dataset, tmp_path):
+def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(folder, mean_image, make_dataset, tmp_path, monkeypatch):
+    clock = SimpleNamespace(perf_counter=count(0.0, 0.01).__next__, monotonic=time.monotonic)  # a step takes 0.01 s
+    monkeypatch.setattr(learner, "time", clock)
     budget = Budget.equal(0.5)
-    budget.paces.keep(mean_image.name, Pace(0.0, 0.5, is_confirmed=False))  # a step takes a thousandth of that
+    budget.paces.keep(mean_image.name, Pace(0.0, 0.5, is_confirmed=False))
     run = FitRun(folder=None if folder is None else tmp_path / folder)
     fitted = mean_image.fit(make_dataset(), budget, run)
     assert fitted.cost.steps > 1  # which that pace would leave
