@@ -1,4 +1,4 @@
-"""`ultragray scenes` and `ultragray datasets` against a real service."""
+"""`ultragray scenes`, `datasets`, `recordings` and `registrations` against a real service."""
 
 import json
 
@@ -120,6 +120,23 @@ def test_a_folder_becomes_a_dataset(server, sweep):
     for name in ("tiny", "half"):
         assert done(server, "datasets", "delete", name) == f"{name} deleted\n"
     assert "tiny" in refused(server, "datasets", "show", "tiny")
+
+
+def test_a_recording_is_shown_and_becomes_a_dataset_or_is_given_up(server, tmp_path):
+    sweep = noise_sweep(tmp_path / "sweep")
+    for name in ("kept", "given-up"):
+        assert f"{name} is open, with 10 frames" in done(server, "live", sweep, name, "--open", "--speed", 1000)
+        shown = json.loads(done(server, "recordings", "show", name, "--json"))
+        assert (shown["name"], shown["frames"], shown["next_number"]) == (name, 10, 10)
+    assert "next_number" in done(server, "recordings", "show", "kept")
+    finished = done(server, "recordings", "finish", "kept")
+    assert finished == "recorded kept: 8 training and 2 held-out frames\n"
+    assert json.loads(done(server, "datasets", "show", "kept", "--json"))["train_frames"] == 8
+    assert done(server, "recordings", "delete", "given-up") == "given-up deleted\n"
+    for command in ("show", "finish", "delete"):
+        assert "there is no open recording 'kept'" in refused(server, "recordings", command, "kept")
+        assert "there is no dataset 'given-up'" in refused(server, "recordings", command, "given-up")
+    done(server, "datasets", "delete", "kept")
 
 
 def test_the_port_of_grpc_is_told_from_that_of_http(server):
