@@ -140,7 +140,7 @@ describe("what is written as name = value", () => {
   it("is asked for by the names that the service takes", async () => {
     const page = await openPage(at, "#/train?show=render");
     await page.getByText("More", { exact: true }).click();
-    await page.getByLabel(/worker_labels, probe, tools, display: one name = value a line/).fill('worker_labels = {"site": "nowhere"}');
+    await page.getByLabel(/\bworker_labels\b.*: one name = value a line/).fill('worker_labels = {"site": "nowhere"}');
     await page.getByLabel("Count").fill("3");
     await page.getByRole("button", { name: "Start rendering" }).click();
     await page.getByText("nowhere").first().waitFor();

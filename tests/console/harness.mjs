@@ -19,7 +19,7 @@ const CHROMIUM_FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disabl
 const START_TIMEOUT_MS = 600_000;
 export const SCREENSHOTS = path.join(ROOT, "build/console-screenshots");
 export const TIMEOUT_MS = 120_000; // of what a page should show: the machine may be busy
-export const BACKGROUND_TIMEOUT_MS = 600_000; // of jobs and checks of sweeps and scenes: their processes come last on a busy machine
+export const BACKGROUND_TIMEOUT_MS = 1_800_000; // of jobs and checks of sweeps and scenes: their processes come last on a busy machine
 
 /** A free port, below those that the system gives to connections: the service must come back on the same one. */
 function freePort() {
