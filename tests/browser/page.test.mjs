@@ -16,7 +16,7 @@ const LOADS = Math.max(20, FRAMES / 2); // of scenes
 const DAMAGES = Math.max(60, FRAMES / 10); // of a scene file
 const MOST_KEPT_MIB = 48; // after many loads: a scene has more
 
-let site, url, browser;
+let site, framed, url, browser;
 
 before(async () => {
   site = await openSite();
@@ -27,7 +27,14 @@ before(async () => {
 after(async () => {
   await browser?.close();
   site?.close();
+  framed?.close();
 });
+
+/** Where the random frames are; made when they are first asked for. */
+async function framedUrl() {
+  framed ??= await openSite(FRAMES);
+  return framed.url;
+}
 
 async function photograph(page, name) {
   mkdirSync(SCREENSHOTS, { recursive: true });
@@ -46,7 +53,7 @@ async function shown(page) {
 
 test("random frames in Chromium are those of the reference", async () => {
   const page = await browser.newPage();
-  await page.goto(url);
+  await page.goto(await framedUrl());
   check(await page.evaluate(differences, { MOST, renderer: "wasm" }));
   await page.close();
 });
@@ -56,7 +63,7 @@ test("random frames in Firefox are those of the reference", { skip: missing ?? f
   try {
     const page = await firefox.newPage();
     page.setDefaultTimeout(TIMEOUT_MS);
-    await page.goto(url);
+    await page.goto(await framedUrl());
     check(await page.evaluate(differences, { MOST, renderer: "wasm" }));
   } finally {
     await firefox.close();

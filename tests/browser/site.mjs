@@ -1,4 +1,4 @@
-/** The exported page of the demo scene with random frames as the reference renders them, handed out by Python's http.server. */
+/** The exported page of the demo scene, on demand with random frames as the reference renders them, handed out by Python's http.server. */
 
 import assert from "node:assert/strict";
 import { execFileSync, spawn } from "node:child_process";
@@ -9,7 +9,7 @@ import path from "node:path";
 
 import { PYTHON, ROOT, SOURCES } from "../console/harness.mjs";
 
-export const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // the reference takes seconds for one
+export const FRAMES = Number(process.env.ULTRAGRAY_BROWSER_FRAMES ?? 60); // of the tests that compare them
 const SEED = 7;
 export const MOST = 5e-4; // of a value's difference from the reference
 // Where a Gaussian just reaches so much for one of the two, as with the native kernels; and where a point that speckle is
@@ -17,10 +17,11 @@ export const MOST = 5e-4; // of a value's difference from the reference
 const MOST_AT_THRESHOLDS = { off: 1 / 255, natural: 0.1 };
 const MOST_FLIPS = 1e-4; // share of such values
 
-export async function openSite() {
+/** `frames`: how many random ones the site holds; the reference takes seconds for each. */
+export async function openSite(frames = 0) {
   const root = mkdtempSync(path.join(tmpdir(), "ultragray-page-"));
   const folder = path.join(root, "page");
-  execFileSync(PYTHON, [path.join(ROOT, "tests/browser/make_frames.py"), folder, String(FRAMES), String(SEED)], {
+  execFileSync(PYTHON, [path.join(ROOT, "tests/browser/make_frames.py"), folder, String(frames), String(SEED)], {
     env: { ...process.env, PYTHONPATH: SOURCES, OMP_NUM_THREADS: "1" },
     stdio: ["ignore", "inherit", "inherit"],
   });

@@ -6,7 +6,7 @@ import path from "node:path";
 import { after, before, test } from "node:test";
 
 import { launch, launchWithGpu } from "../console/harness.mjs";
-import { check, differences, MOST, openSite } from "./site.mjs";
+import { check, differences, FRAMES, MOST, openSite } from "./site.mjs";
 
 const NONE = "this machine's Chromium has no WebGPU adapter, not even in software";
 
@@ -39,10 +39,15 @@ const limited = (bytes) => `;for (const name of ["maxStorageBufferBindingSize", 
 test("random frames of WebGPU are those of the reference", async (t) => {
   if (!browser) return t.skip(NONE);
   t.diagnostic(`adapter: ${adapter.name}`);
-  const page = await browser.newPage();
-  await page.goto(site.url);
-  check(await page.evaluate(differences, { MOST, renderer: "webgpu" }));
-  await page.close();
+  const framed = await openSite(FRAMES);
+  try {
+    const page = await browser.newPage();
+    await page.goto(framed.url);
+    check(await page.evaluate(differences, { MOST, renderer: "webgpu" }));
+    await page.close();
+  } finally {
+    framed.close();
+  }
 });
 
 test("a lost device costs no frame: WebAssembly draws those on their way, and the next ones", async (t) => {
