@@ -99,6 +99,7 @@ def followed(sweep: Sweep, kills: int) -> list[Version]:
                 found = super().next(most)
                 if found is None and arrived == len(sweep) and self.dataset is None:
                     self.dataset = Dataset("sweep", *split_sequence(sweep, len(sweep), None, None))
+                    found = super().next(most)
                 return found
 
         class Live(_Live):

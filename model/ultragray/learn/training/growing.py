@@ -4,7 +4,8 @@ frames and on all of them in turn.
 New Gaussians lie between a new frame and its neighbours, as those of an informed start do (`initial`), so that a frame
 shows something before the first step on it. What a whole sweep would tell (spacing, shadows, thickness of a slice) is
 surveyed again whenever the frames have become half as many more. Every fifth frame from the third is held out, as it
-will be of the finished data set (`sweep.split_sequence`), and judges each version.
+will be of the finished data set (`sweep.split_sequence`), and judges each version, at its full size. Frames to train
+from are made small, for steps that take little time: a scene of noisy frames gains most by seeing each of them often.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -59,7 +61,10 @@ LEAST_FRAMES = 4  # to train from, before anything is shown
 SURVEY_GROWTH = 1.5
 WINDOW_FRAMES = 6  # about each new one, among which it finds its neighbours
 STILL = 0.25  # of the usual spacing: a frame nearer to one that is there already shows no new place
-MOST_AT_ONCE, SMALL_PIXELS = 16_000, 8_000  # Gaussians, and pixels of a frame, of a sweep that is learned in seconds
+MOST_AT_ONCE = 16_000  # Gaussians of a sweep that is over and learned in seconds
+SMALL_PIXELS = 8_000  # of a frame to train from, at least
+SIZED_BY = 16  # frames, which tell what becomes smaller
+FOURS, FAR_LESS = ((2, 2), (1, 4), (4, 1)), 0.5  # rows and columns; of the variance that a square hides
 RECENT_FRAMES, RECENT_STEPS = 16, 40  # of a new frame, every other is on recent ones; then all are on all frames
 COARSE_STEPS = (60, 20)  # of Gaussians' first: on frames of half the size; of a quarter, which take a third of the time
 COARSE_GAUSSIANS = 0.5  # of the pixels of a frame: with more of them, it is they that take the time
@@ -89,7 +94,8 @@ class GrowingTrainer:
         self._device = training_device(device, backend)
         self._generator = torch.Generator().manual_seed(seed)
         self._train: Sweep | None = None
-        self._held_out: Sweep | None = None
+        self._held_out: Sweep | None = None  # at full size
+        self._size: tuple[int, int] | None = None  # rows and columns of the frames to train from
         self.frame_count = self.step = 0
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
@@ -208,16 +214,12 @@ class GrowingTrainer:
         """Another trainer of the same sweep, which is over: of all frames at once, at the poses of the path that they
         agree with.
 
-        It has few Gaussians, and small frames, so that it takes many steps in seconds: what a scene of noisy frames
-        gains most by is to see each frame often. It is judged by frames of full size, and has no checkpoints.
+        It has few Gaussians, so that it takes many steps in seconds, and no checkpoints.
         """
-        small = replace(dataset, train=_small(dataset.train), val=_small(dataset.val))
-        whole = PoseRefinement.of(small, "path")
+        whole = PoseRefinement.of(dataset, "path")
         other = GrowingTrainer(self.name, self._probe, seed=self._given.seed, device=self._asked, backend=self._backend)
         other._whole, other.judged = whole, self.judged
         other.add(*in_recorded_order(whole.dataset))
-        other._held_out = replace(dataset.val, poses=whole.dataset.val.poses)
-        other._info = replace(other._info, image_height=dataset.train.height, image_width=dataset.train.width)
         return other
 
     def save(self, path: Path) -> None:
@@ -260,12 +262,14 @@ class GrowingTrainer:
         sweep = Sweep(images, poses, self._probe, numbers, self.name)
         if min(sweep.height, sweep.width) < SSIM_WINDOW:
             raise DatasetInvalid(f"{self.name}: images must have at least {SSIM_WINDOW} rows and columns")
-        self._train = _joined(self._train, sweep.select(np.flatnonzero(~is_held_out)))
+        self._size = self._size or _small_size(images)
+        self._train = _joined(self._train, _resized(sweep.select(np.flatnonzero(~is_held_out)), self._size))
         self._held_out = _joined(self._held_out, sweep.select(np.flatnonzero(is_held_out)))
         self.frame_count += len(images)
 
     def _survey(self, train: Sweep) -> None:
         """Looks at all frames for what the settings leave to the data, and for who lies beside whom."""
+        assert self._held_out is not None
         geometry = Geometry.of(Dataset(self.name, train, train.select([])))
         if not self._surveyed and not self.step:
             self._centre_mm = geometry.centre_mm
@@ -283,8 +287,8 @@ class GrowingTrainer:
         self._info = SceneInfo(
             centre_mm=self._centre_mm.tolist(),
             probe=self._probe,
-            image_height=train.height,
-            image_width=train.width,
+            image_height=self._held_out.height,
+            image_width=self._held_out.width,
             intensity=self._config.intensity,
             dataset_name=self.name,
             sh_degree=self._config.sh_degree,
@@ -395,15 +399,33 @@ class GrowingTrainer:
         ).to_dict()
 
 
-def _small(sweep: Sweep) -> Sweep:
-    """The frames, each pixel the mean of four, as often as that keeps SMALL_PIXELS and more."""
-    images = sweep.images
-    while True:
-        count, height, width = images.shape
-        if height % 2 or width % 2 or height * width < 4 * SMALL_PIXELS or min(height, width) < 2 * SSIM_WINDOW:
-            return replace(sweep, images=images)
-        fours = images.reshape(count, height // 2, 2, width // 2, 2)
-        images = ((fours.sum(axis=(2, 4), dtype=np.uint16) + 2) // 4).astype(np.uint8)
+def _small_size(images: ByteArray) -> tuple[int, int]:  # [F, H, W]
+    """Rows and columns of frames of which four pixels become one, as often as that keeps SMALL_PIXELS and more: those
+    of a square, or of one row or column where that hides far less. The lines of a fan lie closer than its beams are
+    wide.
+    """
+    some = images[spread_places(len(images), SIZED_BY)].astype(np.float32)
+    while some[0].size >= 4 * SMALL_PIXELS:
+        count, height, width = some.shape
+        found = []
+        for rows, columns in FOURS:
+            small = height // rows, width // columns
+            if height % rows == width % columns == 0 and min(small) >= SSIM_WINDOW:
+                fours = some.reshape(count, small[0], rows, small[1], columns)
+                hidden = float(fours.var(axis=(2, 4)).mean()) / (1.0 if rows == columns else FAR_LESS)
+                found.append((hidden, fours.mean(axis=(2, 4))))
+        if not found:
+            break
+        some = min(found, key=lambda one: one[0])[1]
+    return some.shape[1], some.shape[2]
+
+
+def _resized(sweep: Sweep, size: tuple[int, int]) -> Sweep:
+    """Its frames with fewer rows and columns, each pixel the mean of those in its place."""
+    images = np.empty((len(sweep), *size), np.uint8)
+    for image, small in zip(sweep.images, images, strict=True):
+        small[:] = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+    return replace(sweep, images=images)
 
 
 def _joined(before: Sweep | None, added: Sweep) -> Sweep:

@@ -12,6 +12,7 @@ from ultragray.learn.sweep import Dataset, Sweep, split_sequence
 from ultragray.learn.training import growing
 from ultragray.learn.training.growing import GrowingTrainer, Judgement
 from ultragray.learn.training.optimizer import Optimizer
+from ultragray.learn.training.poses import PoseRefinement
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses
 from ultragray.phantom.imaging import simulate
 from ultragray.scene.confidence import Assessor
@@ -43,23 +44,49 @@ def all_psnr_db(trainer, monkeypatch):
 def test_a_sweep_that_is_over_is_learned_anew_from_small_frames(sweep, monkeypatch):
     monkeypatch.setattr(growing, "SMALL_PIXELS", (SIDE // 2) ** 2)
     monkeypatch.setattr(growing, "MOST_AT_ONCE", 1000)
-    heights, true_render = [], growing.render
-    monkeypatch.setattr(growing, "render", lambda *a, **k: heights.append(k["height"]) or true_render(*a, **k))
+    sizes, true_render = [], growing.render
+    monkeypatch.setattr(
+        growing, "render", lambda *a, **k: sizes.append(k["height"] * k["width"]) or true_render(*a, **k)
+    )
     dataset = Dataset("phantom", *split_sequence(sweep, COUNT, None, None))
     trainer = grown(sweep, steps=0)
     trainer.accept(trainer.judge())
-    heights.clear()
     again = trainer.anew(dataset)
     at_first = all_psnr_db(again, monkeypatch)
     for step in range(40):
         again.take_step(0.1 ** (step / 40))
     judgement = again.judge()
-    assert set(heights) == {SIDE // 2}
+    assert set(sizes) == {growing.SMALL_PIXELS}
     assert judgement.mean_psnr_db > at_first + 2.0
     assert not again.is_worse(judgement)  # than what was shown of the frames as they came
     scene = again.scene(judgement)
     assert (scene.info.image_height, scene.gaussian_count) == (SIDE, 1000)
     assert len(scene.training_poses) == len(dataset.train)
+
+
+def test_poses_of_a_sweep_that_is_over_are_those_that_its_whole_frames_agree_with(sweep, monkeypatch):
+    monkeypatch.setattr(growing, "SMALL_PIXELS", (SIDE // 2) ** 2)
+    sides, true_of = [], PoseRefinement.of
+    monkeypatch.setattr(PoseRefinement, "of", lambda one, mode: sides.append(one.train.height) or true_of(one, mode))
+    grown(sweep, steps=0).anew(Dataset("phantom", *split_sequence(sweep, COUNT, None, None)))
+    assert sides == [SIDE]
+
+
+@pytest.mark.parametrize(("like", "smaller"), [((), (2, 2)), ((2,), (1, 4)), ((1,), (4, 1)), ((1, 2), (2, 2))])
+def test_frames_become_smaller_where_pixels_are_like_their_neighbours(sweep, like, smaller, monkeypatch):
+    monkeypatch.setattr(growing, "SMALL_PIXELS", SIDE * SIDE // 4)
+    images = np.random.default_rng(0).integers(0, 250, sweep.images.shape, dtype=np.uint8)
+    for axis in like:
+        images = np.repeat(images.take(range(SIDE // 4), axis), 4, axis)
+    trainer = GrowingTrainer("phantom", PHANTOM_PROBE)
+    trainer.add(images, sweep.poses)
+    height, width = (SIDE // part for part in smaller)
+    shown = trainer._train.images
+    assert shown.shape[1:] == (height, width)
+    fours = images[:1].reshape(1, height, smaller[0], width, smaller[1]).mean(axis=(2, 4))
+    assert np.abs(shown[:1] - fours).max() <= 0.5
+    scene = trainer.scene(trainer.judge())
+    assert (scene.info.image_height, scene.info.image_width) == (SIDE, SIDE)
 
 
 def test_it_learns_what_lies_between_its_frames(sweep, monkeypatch):

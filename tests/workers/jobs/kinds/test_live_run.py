@@ -1,5 +1,6 @@
 """What a live job makes of a sweep when its last frame has come."""
 
+from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from ultragray import LinearProbe
 from ultragray.learn.sweep import Dataset, Sweep, split_sequence
 from ultragray.learn.training.growing import GrowingTrainer
 from ultragray_workers.jobs.kinds import live_run
+from ultragray_workers.jobs.progress import Progress
 
 PROBE, FRAMES = LinearProbe(20.0, 0.0, 25.0), 12
 
@@ -21,25 +23,37 @@ def sweep():
     return Sweep(images, poses, PROBE, np.arange(FRAMES), "sweep")
 
 
-def settled(dataset, monkeypatch):
-    """How often a sweep is learned anew and served after its last frame, without the seconds that this takes."""
-    live, done = object.__new__(live_run._Live), []
-    live.following = SimpleNamespace(dataset=dataset)
+def served(dataset, monkeypatch, tmp_path, is_worse=lambda trainer: False):
+    """The scenes that are served from the last frame on, and the trainer before; the clock ticks when it is asked."""
+    ticks, scenes = count(), []
+    monkeypatch.setattr(live_run, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+    monkeypatch.setattr(GrowingTrainer, "is_worse", lambda trainer, _: is_worse(trainer))
+    live = object.__new__(live_run._Live)
+    live.following, live._run = SimpleNamespace(dataset=dataset), SimpleNamespace(progress=Progress())
+    live._judged = tmp_path / live_run.JUDGED
     live.trainer = trainer = GrowingTrainer("sweep", PROBE)
     trainer.add(*live_run.in_recorded_order(dataset))
-    for constant in ("SETTLE_S", "LEAST_SETTLE_S"):
-        monkeypatch.setattr(live_run, constant, 1e-9)
-    monkeypatch.setattr(live, "serve", lambda: done.append(live.trainer))
+    monkeypatch.setattr(live, "publish", scenes.append)
     monkeypatch.setattr(live, "_tell", lambda: None)
     live.settle()
-    assert all(one is not trainer for one in done)
-    return len(done)
+    return scenes, trainer
 
 
-def test_a_recording_that_is_over_is_learned_anew_and_served(sweep, monkeypatch):
-    assert settled(Dataset("sweep", *split_sequence(sweep, FRAMES, None, None)), monkeypatch) == 1
+def test_a_recording_that_is_over_is_served_as_it_is_and_then_learned_anew(sweep, monkeypatch, tmp_path):
+    dataset = Dataset("sweep", *split_sequence(sweep, FRAMES, None, None))
+    scenes, before = served(dataset, monkeypatch, tmp_path)
+    assert np.array_equal(scenes[0].splats["means"], before.scene(before.judge()).splats["means"])
+    steps = [scene.info.training["step"] for scene in scenes]
+    assert len(steps) > 2
+    assert steps == sorted(set(steps))
 
 
-def test_a_data_set_that_holds_out_other_frames_is_left_to_the_training(sweep, monkeypatch):
+def test_versions_that_are_worse_are_not_served_meanwhile(sweep, monkeypatch, tmp_path):
+    dataset = Dataset("sweep", *split_sequence(sweep, FRAMES, None, None))
+    scenes, before = served(dataset, monkeypatch, tmp_path, lambda trainer: trainer.step > 0)
+    assert [scene.info.training["step"] for scene in scenes] == [before.step]
+
+
+def test_a_data_set_that_holds_out_other_frames_is_left_to_the_training(sweep, monkeypatch, tmp_path):
     dataset = Dataset("sweep", sweep.select(np.arange(8)), sweep.select(np.arange(8, FRAMES)))
-    assert settled(dataset, monkeypatch) == 0
+    assert served(dataset, monkeypatch, tmp_path)[0] == []

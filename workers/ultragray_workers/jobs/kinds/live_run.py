@@ -16,7 +16,7 @@ import numpy as np
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, Dataset, in_recorded_order
-from ultragray.learn.training.growing import LOST_DB, GrowingTrainer, Judgement
+from ultragray.learn.training.growing import LOST_DB, GrowingTrainer
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.datasets.store import DatasetStore, open_datasets
@@ -34,9 +34,11 @@ CHECKPOINT, JUDGED = "live.safetensors", "judged.json"  # of the folder of the r
 CHECKPOINT_EVERY_S = 5.0
 STEPS_A_VERSION = 4.0  # times as long as it takes to judge and serve one
 POLL_S = 0.1  # while nothing is to be done but to wait for frames
-LOOK_EVERY_S = 0.25  # for new frames in a storage elsewhere, to which each question takes its time
+LOOK_EVERY_S = 0.25  # for new frames: each question to a storage elsewhere takes its time, and so does each addition
 PAUSE_STEPS = 150  # after which a sweep that goes no further is learned; they become ever smaller
 SETTLE_S, LEAST_SETTLE_S = 17.0, 5.0  # after the last frame, for the whole sweep at once; of them steps at least
+SETTLING_RATE = 2.0  # of the first of them: they are few
+SETTLING_VERSION_S = 0.75  # of them, before the first version, and three times as long before each further one
 MOST_FRAMES = 32  # taken from the recording before the next step
 
 
@@ -67,7 +69,7 @@ class Following:
         if self.dataset is not None:
             return self._left(most)
         now_s = time.monotonic()
-        if not self._datasets.storage.is_near and now_s - self._looked_at_s < LOOK_EVERY_S:
+        if now_s - self._looked_at_s < LOOK_EVERY_S:
             return None
         self._looked_at_s = now_s
         found = []
@@ -130,7 +132,8 @@ class _Live:
             self._tell()
 
     def settle(self) -> None:
-        """Learns the whole sweep anew for a while, in steps that become ever smaller. Raises Stopped.
+        """Serves the scene as the last frame leaves it, then learns the whole sweep anew for a while, in steps that
+        become ever smaller, and serves what that comes to on the way. Raises Stopped.
 
         Nothing where the data set holds out other frames than a recording does: what the trainer judged by is not that.
         """
@@ -139,40 +142,46 @@ class _Live:
             return
         if trainer.frame_count != len(dataset.train) + len(dataset.val):
             return
-        end_s = time.monotonic() + SETTLE_S
+        end_s, version_s = time.monotonic() + SETTLE_S, SETTLING_VERSION_S
+        self._serve_if_as_good(trainer)
         settled = trainer.anew(dataset)
         begun_s = time.monotonic()
         while (share := (time.monotonic() - begun_s) / max(end_s - begun_s, LEAST_SETTLE_S)) < 1.0:
-            settled.take_step(0.1**share)
+            settled.take_step(SETTLING_RATE * 0.1**share)
+            if time.monotonic() - begun_s >= version_s:
+                self._serve_if_as_good(settled)
+                version_s *= 3.0
             self._tell()
         self.trainer = settled
         self.serve()
 
     def serve(self) -> None:
-        """Serves the scene as it is, unless it has become worse."""
+        """Serves the scene as it is; where it has become worse, it goes on in smaller steps instead."""
         begun_s = time.monotonic()
-        judgement = self.trainer.judge()
-        if self.trainer.is_worse(judgement):
-            sys.stderr.write(f"step {self.trainer.step:,}: not served, for the version before is better\n")
+        if not self._serve_if_as_good(self.trainer):
             self.trainer.slow_down()
-        else:
-            self._show(judgement)
         self._served_at_s, self._served_step = time.monotonic(), self.trainer.step
         self._serving_s = self._served_at_s - begun_s
 
-    def _show(self, judgement: Judgement) -> None:
-        self.scene = self.trainer.scene(judgement)
+    def _serve_if_as_good(self, trainer: GrowingTrainer) -> bool:
+        """Whether its scene is served: the version before is not better."""
+        judgement = trainer.judge()
+        if trainer.is_worse(judgement):
+            sys.stderr.write(f"step {trainer.step:,}: not served, for the version before is better\n")
+            return False
+        self.scene = trainer.scene(judgement)
         self.publish(self.scene)
-        self.trainer.accept(judgement)
+        trainer.accept(judgement)
         self._judged.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(self._judged, json.dumps(self.trainer.judged))
+        write_whole(self._judged, json.dumps(trainer.judged))
         self._run.progress = replace(self._run.progress, val_psnr_db=judgement.mean_psnr_db)
         held_out = "" if judgement.mean_psnr_db is None else f", held out {judgement.mean_psnr_db:.2f} dB"
         sys.stderr.write(
-            f"step {self.trainer.step:,}, frame {self.trainer.frame_count:,}: a version of "
-            f"{self.trainer.gaussian_count:,} Gaussians is served{held_out}\n"
+            f"step {trainer.step:,}, frame {trainer.frame_count:,}: a version of "
+            f"{trainer.gaussian_count:,} Gaussians is served{held_out}\n"
         )
         sys.stderr.flush()
+        return True
 
     def publish(self, scene: GaussianScene) -> None:
         scene.save(self._file)
