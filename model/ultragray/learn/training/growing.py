@@ -100,7 +100,9 @@ class GrowingTrainer:
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
-        self.judged: dict[int, float] = {}  # PSNR of the newest version shown that was judged by a held-out frame
+        # PSNR of the newest version shown that was judged by a held-out frame; after a death perhaps by some that are
+        # still to come again.
+        self.judged: dict[int, float] = {}
         self._whole: PoseRefinement | None = None  # the poses of a sweep that came at once
         self._caution = 1.0  # factor on all rates: less after a version that was worse
 
@@ -182,7 +184,7 @@ class GrowingTrainer:
         held_out = self._held_out
         if held_out is None or not len(held_out):
             return Judgement({}, {})
-        known = np.array(sorted(self.judged), np.int64)
+        known = np.array(sorted(self.judged.keys() & set(range(len(held_out)))), np.int64)
         newer = np.setdiff1d(np.arange(len(held_out)), known)
         chosen = np.concatenate([known[spread_places(len(known), JUDGES)], newer[spread_places(len(newer), JUDGES)]])
         psnr_db, ms_ssim = {}, {}

@@ -160,6 +160,17 @@ def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_been_killed(sweep, tmp_pa
     assert end(again) == pytest.approx(end(trainer), abs=0.3)
 
 
+def test_a_version_shown_before_a_death_may_have_been_judged_by_frames_that_are_still_to_come_again(sweep, tmp_path):
+    trainer = grown(sweep, until=12)
+    trainer.save(tmp_path / "checkpoint")
+    again = GrowingTrainer("phantom", PHANTOM_PROBE)
+    again.restore(tmp_path / "checkpoint", sweep.images[:12], sweep.poses[:12])
+    again.judged = {0: 0.0, 1: 0.0, 3: 99.0}
+    judgement = again.judge()
+    assert judgement.psnr_db.keys() == {0, 1}
+    assert not again.is_worse(judgement)
+
+
 def test_a_version_that_shows_the_same_frames_worse_is_told_from_one_that_does_not(sweep):
     trainer = grown(sweep, until=12)
     trainer.accept(trainer.judge())

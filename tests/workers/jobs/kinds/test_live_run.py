@@ -57,3 +57,20 @@ def test_versions_that_are_worse_are_not_served_meanwhile(sweep, monkeypatch, tm
 def test_a_data_set_that_holds_out_other_frames_is_left_to_the_training(sweep, monkeypatch, tmp_path):
     dataset = Dataset("sweep", sweep.select(np.arange(8)), sweep.select(np.arange(8, FRAMES)))
     assert served(dataset, monkeypatch, tmp_path)[0] == []
+
+
+def test_another_process_goes_on_from_what_is_served(sweep, monkeypatch, tmp_path):
+    scenes = []
+    live = object.__new__(live_run._Live)
+    live._run, live._job = SimpleNamespace(progress=Progress()), SimpleNamespace(version_every_s=0.0)
+    live._judged, live._checkpoint = tmp_path / live_run.JUDGED, tmp_path / live_run.CHECKPOINT
+    live._serving_s, live._served_step = 0.0, 0
+    live._served_at_s, live._saved_at_s = float("-inf"), float("inf")  # a version is due, and nothing else is
+    live.trainer = GrowingTrainer("sweep", PROBE)
+    live.trainer.add(sweep.images, sweep.poses)
+    live.trainer.take_step()
+    monkeypatch.setattr(live, "publish", scenes.append)
+    live._serve_now_and_then()
+    again = GrowingTrainer("sweep", PROBE)
+    again.restore(live._checkpoint, sweep.images, sweep.poses)
+    assert [scene.info.training["step"] for scene in scenes] == [again.step] == [1]

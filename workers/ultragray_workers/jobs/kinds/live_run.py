@@ -155,13 +155,15 @@ class _Live:
         self.trainer = settled
         self.serve()
 
-    def serve(self) -> None:
-        """Serves the scene as it is; where it has become worse, it goes on in smaller steps instead."""
+    def serve(self) -> bool:
+        """Whether the scene as it is is served; where it has become worse, it goes on in smaller steps instead."""
         begun_s = time.monotonic()
-        if not self._serve_if_as_good(self.trainer):
+        is_served = self._serve_if_as_good(self.trainer)
+        if not is_served:
             self.trainer.slow_down()
         self._served_at_s, self._served_step = time.monotonic(), self.trainer.step
         self._serving_s = self._served_at_s - begun_s
+        return is_served
 
     def _serve_if_as_good(self, trainer: GrowingTrainer) -> bool:
         """Whether its scene is served: the version before is not better."""
@@ -200,9 +202,9 @@ class _Live:
     def _serve_now_and_then(self) -> None:
         now_s = time.monotonic()
         wait_s = max(self._job.version_every_s, STEPS_A_VERSION * self._serving_s)
-        if self.trainer.step > self._served_step and now_s - self._served_at_s >= wait_s:
-            self.serve()
-        if self.trainer.is_growing and now_s - self._saved_at_s >= CHECKPOINT_EVERY_S:
+        is_due = self.trainer.step > self._served_step and now_s - self._served_at_s >= wait_s
+        is_served = is_due and self.serve()  # then it is saved, too: who goes on from there has nothing to make up for
+        if self.trainer.is_growing and (is_served or now_s - self._saved_at_s >= CHECKPOINT_EVERY_S):
             self._save()
 
     def _tell(self) -> None:
