@@ -708,7 +708,7 @@ class MotionSettings:
     chest_mm: float | None = None  # Built in: deep tissue goes so far from the skin and back.
     pulse_mm: float | None = None  # Built in: the wall of a vessel goes so far out, and tissue about it makes room.
     vessel: Shape | None = None  # The vessel that pulsates: a tube, or a label of the scene.
-    steps: int = 3000  # Of the fit to frames.
+    steps: int = 6000  # Of the fit to frames.
     # Between splines of the field. Default: 15; of a field that is given 6; of a vessel half its radius, or what
     # there is room for.
     spacing_mm: float | None = None

@@ -43,7 +43,8 @@ from ultragray.scene.shapes import LabelShape, TubeShape
 Numbers = npt.NDArray[np.float64]
 Report = Callable[[int, float], None]  # of the steps done and the loss
 
-BATCH = 4
+BATCH = 8  # frames of a step
+FINDING_BATCH = 4  # while numbers are still wrong, a scene that learns slower hides less of it
 RATES = {"means": 1e-2, "scales": 1e-2, "quats": 1e-2, "transmittances": 1e-2, "sh0": 2e-2, "shN": 1e-4}
 FIELD_RATE_MM = 0.25  # a step, of the displacement from end to end
 BENDING = 1e-3  # price of a squared second difference of the field, 1/mm²
@@ -176,7 +177,7 @@ def find_motion(
     in_time = np.argsort(sweep.frame_numbers, kind="stable")
     levels = torch.zeros(len(sweep))
     levels[in_time] = torch.from_numpy(depths_in_time(sweep.images[in_time])).float()
-    fit = _Fit(scene, sweep, Grid.over(scene.info, spacing_mm))
+    fit = _Fit(scene, sweep, Grid.over(scene.info, spacing_mm), FINDING_BATCH)
     fit.begin_with(torch.from_numpy(sweep.poses[:, :3, 2].mean(axis=0)).float())
     for step in range(steps):
         if step and step * ROUNDS // steps > (step - 1) * ROUNDS // steps:
@@ -213,8 +214,8 @@ def depths_in_time(images: npt.NDArray[np.uint8]) -> Numbers:  # [F, H, W] in ti
 class _Fit:
     """Gaussians and a field of one mode, learned together."""
 
-    def __init__(self, scene: GaussianScene, sweep: Sweep, grid: Grid) -> None:
-        self._scene, self._sweep, self._grid = scene, sweep, grid
+    def __init__(self, scene: GaussianScene, sweep: Sweep, grid: Grid, batch: int = BATCH) -> None:
+        self._scene, self._sweep, self._grid, self._batch = scene, sweep, grid, batch
         self.field = torch.zeros((1, *grid.sides, 3), requires_grad=True)  # mm, of a share of 1
         self._splats: dict[str, Any] = {
             key: tensor.detach().clone().requires_grad_() for key, tensor in scene.splats.items()
@@ -267,7 +268,7 @@ class _Fit:
 
     def step(self, done: float, shares: Tensor) -> float:  # [F] -> loss
         """One step of a batch, when a share of all steps is done."""
-        batch = torch.randperm(len(shares), generator=self._generator)[:BATCH]
+        batch = torch.randperm(len(shares), generator=self._generator)[: self._batch]
         truth = self._truth[batch].float() / 255.0
         loss = image_loss(self._rendered(batch, shares[batch]), truth, TEXTURE) + BENDING * _bending(self.field)
         for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):

@@ -10,7 +10,7 @@ from ultragray.geometry.pose import MAX_POSITION_MM
 from ultragray.scene.modes import Motion
 from ultragray.scene.shapes import LabelShape, Shape, TubeShape
 
-FIT_STEPS = 3000  # of the fit of a mode to a sweep
+FIT_STEPS = 6000  # of the fit of a mode to a sweep
 SPACING_MM, GIVEN_SPACING_MM = 15.0, 6.0  # between splines: of a field that is learned, of one that is given
 AUTO = "auto"  # in the place of a surrogate: the numbers of the frames are found
 FIELD_LEADS = ("from-rest", "to-rest")  # which way the vectors of a field lead
