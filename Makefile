@@ -234,7 +234,7 @@ from-labels: $(VENV)/installed-dev  ## scenes from labels against theory and the
 	@$(BIN)/python benchmarks/figures.py show from_labels
 	$(KEEP) from_labels
 
-motion: $(VENV)/installed-dev  ## what is learned of tissue that breathes, and what a frame of it costs; trains first, ten minutes
+motion: $(VENV)/installed-dev  ## what is learned of tissue that breathes, and what a frame of it costs; trains first, half an hour
 	$(READY)
 	$(BIN)/python benchmarks/motion.py $(DATA) $(ARGS)
 	$(KEEP) motion
@@ -257,7 +257,7 @@ preview: $(VENV)/installed-dev  ## what an operator sees while real frames come 
 	@$(BIN)/python benchmarks/figures.py show preview
 	$(KEEP) preview
 
-live: $(VENV)/installed-dev  ## how soon a scene shows what is being scanned, and how well in the end, beside `fast`; ten minutes
+live: $(VENV)/installed-dev  ## how soon a scene shows what is being scanned, and how well in the end, beside `fast`; half an hour
 	$(READY)
 	$(BIN)/python benchmarks/live.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show live

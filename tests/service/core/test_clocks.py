@@ -45,6 +45,13 @@ def test_an_offset_is_found_although_one_way_jitters_by_fifty_milliseconds(offse
     assert abs(exchange.error_ms(found)) <= found.uncertainty_ms < 5.0
 
 
+def test_a_faster_round_trip_counts_at_once():
+    exchange = Exchange(there_s=(0.050, 0.0), back_s=(0.002, 0.0))
+    assert exchange.run(0.1).uncertainty_ms > 20.0
+    exchange.there_s = (0.002, 0.0)
+    assert abs(exchange.error_ms(found := exchange.run(0.1))) <= found.uncertainty_ms < 5.0
+
+
 @pytest.mark.parametrize("drift_ppm", [-60.0, 0.0, 60.0])
 def test_a_drift_is_told_and_followed(drift_ppm):
     exchange = Exchange(drift_ppm=drift_ppm, there_s=(0.002, 0.02), back_s=(0.002, 0.005))

@@ -184,7 +184,7 @@ class GrowingTrainer:
         held_out = self._held_out
         if held_out is None or not len(held_out):
             return Judgement({}, {})
-        known = np.array(sorted(self.judged.keys() & set(range(len(held_out)))), np.int64)
+        known = np.array(sorted(place for place in self.judged if place < len(held_out)), np.int64)
         newer = np.setdiff1d(np.arange(len(held_out)), known)
         chosen = np.concatenate([known[spread_places(len(known), JUDGES)], newer[spread_places(len(newer), JUDGES)]])
         psnr_db, ms_ssim = {}, {}
