@@ -19,14 +19,18 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import PLANE, FloatArray, LinearProbe
 from ultragray.learn.editing.parts import (
     Distance,
+    Surface,
     as_sigmoid,
     clipped,
     harmonics_of,
     joined,
     means_mm,
     moved_gaussians,
+    normals_of,
+    part,
     rebuilt,
     split,
+    stacked,
     with_echo,
     with_label,
 )
@@ -85,7 +89,7 @@ def _inserted(
     radius = 0.5 * float((bounds[1] - bounds[0]).min())
     around = _Around(distance, bounds, max(_NEAR_MM, radius))
     level, roughness = around.echo(scene)
-    outside = clipped(_halved(scene, distance, radius, around), lambda points: -distance(points), _SOFT)
+    outside = _without(scene, radius, around)
     body = _copied(scene, edit, distance, bounds) if edit.texture_from_mm is not None else None
     if body is None:
         sigma = min(max(radius / 6.0, FINEST_MM), COARSEST_MM, finest)
@@ -112,14 +116,18 @@ def _inserted(
 
 
 class _Around:
-    """Places beside a surface, outside it."""
+    """The surface of a body, and places beside it, outside."""
 
     def __init__(self, distance: Distance, bounds: tuple[FloatArray, FloatArray], near_mm: float):
         low, high = bounds[0] - near_mm, bounds[1] + near_mm
         spacing_mm = max(0.5, float((high - low).max()) / _SAMPLES)
         self.grid = VolumeGrid.over_box(low.tolist(), high.tolist(), spacing_mm)
         k, j, i = (axis.ravel() for axis in np.indices([*reversed(self.grid.shape)]))
-        away = distance(np.column_stack([i, j, k]) @ self.grid.affine[:3, :3].T + self.grid.affine[:3, 3])
+        places = np.column_stack([i, j, k]) @ self.grid.affine[:3, :3].T + self.grid.affine[:3, 3]
+        away = distance(places)
+        close = np.abs(away) < spacing_mm
+        points = places[close] - away[close, None] * normals_of(distance, places[close])
+        self.surface = Surface(distance, points, spacing_mm)
         limits = near_mm, max(_BESIDE_MM, 1.5 * spacing_mm)
         self.near, self.beside = ((away > 0.0) & (away < limit) for limit in limits)
 
@@ -135,13 +143,24 @@ class _Around:
         return np.concatenate(list(sample_volume(scene, name, self.grid))).ravel()
 
 
-def _halved(scene: GaussianScene, distance: Distance, radius_mm: float, around: _Around) -> GaussianScene:
-    """The scene with Gaussians that a surface may clip, covered beside it as before.
+def _without(scene: GaussianScene, radius_mm: float, around: _Around) -> GaussianScene | None:
+    """What a body leaves of the scene: Gaussians that reach into it are clipped, the others stay as they are."""
+    halved, distance = _halved(scene, radius_mm, around), around.surface.distance
+    reached = around.surface.reached_by(halved)
+    outside = [] if reached.all() else [part(halved, ~reached)]
+    if reached.any():
+        left = clipped(part(halved, reached), lambda points: -distance(points), _SOFT)
+        outside += [] if left is None else [left]
+    return stacked(halved, outside) if outside else None
+
+
+def _halved(scene: GaussianScene, radius_mm: float, around: _Around) -> GaussianScene:
+    """The scene with Gaussians that the surface may clip, covered beside it as before.
 
     How much more halves cover than the whole did depends on what else lies there. So all of them shrink or grow alike,
     by as much as the secant method finds.
     """
-    halved, whole = split(scene, distance, radius_mm, max(FINEST_MM, math.sqrt(2.0 * _FLATNESS_MM * radius_mm)))
+    halved, whole = split(scene, around.surface, max(FINEST_MM, math.sqrt(2.0 * _FLATNESS_MM * radius_mm)))
 
     def resized(by: float) -> GaussianScene:
         scales = halved.scales.clone()

@@ -125,6 +125,44 @@ def test_tissue_beside_a_body_stays_as_bright_where_long_gaussians_are_halved():
     assert abs(float(after - before)) < 0.02
 
 
+@pytest.mark.parametrize(
+    ("length_mm", "away_mm", "quat", "stays"),
+    [
+        (6.0, 4.0, (1.0, 0.0, 0.0, 0.0), True),
+        (50.0, 4.0, (1.0, 0.0, 0.0, 0.0), True),
+        (6.0, 0.5, (1.0, 0.0, 0.0, 0.0), False),
+        (6.0, 4.0, (1.0, 0.0, 1.0, 0.0), False),
+    ],
+    ids=["beside it", "very long beside it", "at its surface", "pointing at it"],
+)
+def test_a_long_gaussian_is_divided_only_where_it_reaches_into_a_body(scene, length_mm, away_mm, quat, stays):
+    one = part(scene, np.array([0]))
+    splats = {
+        **one.splats,
+        "means": torch.tensor([[0.0, 0.0, 0.5 + away_mm / 10.0]]),
+        "scales": torch.tensor([[length_mm, 0.3, 0.3]]).div(10.0).log(),
+        "quats": torch.tensor([quat]),
+    }
+    needle = GaussianScene.from_splats(splats, info=one.info, training_poses=one.training_poses)
+    edited = insert(needle, InsertEdit(shape=SphereShape(centre_mm=(0.0, 0.0, 0.0), radius_mm=5.0)))
+    kept = (edited.means == needle.means).all(dim=1) & (edited.scales == needle.scales).all(dim=1)
+    assert bool(kept.any()) is stays
+
+
+def test_bone_beside_a_body_looks_as_before():
+    scene = load_demo_scene()
+    shape = EllipsoidShape(centre_mm=(14.238, -10.728, 31.006), radii_mm=(1.7, 1.7, 1.3))
+    scene = part(scene, np.abs(means_mm(scene)[:, 1] + 10.728) < 12.0)
+    pose = np.eye(4)
+    pose[1, 3] = -10.728
+    origins, directions = DEMO_PROBE.scan_lines(SIDE)
+    points = origins + DEMO_PROBE.depths_mm(SIDE)[:, None, None] * directions + pose[:3, 3]
+    away = shape.distance_mm(points.reshape(-1, 3)).reshape(SIDE, SIDE)
+    edited = insert(scene, InsertEdit(shape=shape, tissue="calcification"))
+    before, after = (frames(one, pose, ("echo",), DEMO_PROBE)[0].numpy() for one in (scene, edited))
+    assert np.abs(after - before)[(away > 2.0) & (away < 6.0)].max() < 0.1
+
+
 def test_a_merged_scene_finds_its_place_and_its_gain(scene):
     motion = MoveEdit(shift_mm=(0.8, 0.3, -0.5), turn_deg=(0.0, 1.0, 0.0))
     darker = replace(scene, sh0=scene.sh0 - 0.1)
