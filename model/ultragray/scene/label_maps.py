@@ -1,5 +1,5 @@
 """Labels in files: label maps in NIfTI-1, read by nibabel (extra `nifti`), and NRRD, and painted frames; and fields of
-displacements in the same formats. Free of torch.
+displacements in the same formats, and as transforms of ITK (of `.h5` by h5py, extra `hdf5`). Free of torch.
 
 The reader of NRRD is ours, as that of sequences is (`ultragray.datasets.plus_files`): pynrrd inflates whatever a header
 promises.
@@ -25,6 +25,7 @@ from ultragray.installation import missing_extra
 from ultragray.scene.info import MAX_LABEL, UNPAINTED
 
 LABEL_MAP_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
+VECTOR_FIELD_SUFFIXES = (*LABEL_MAP_SUFFIXES, ".h5", ".tfm")
 MAX_VOXELS = 2**28
 _MAX_NRRD_HEADER_BYTES = 1 << 20
 _NRRD_TYPES = {
@@ -42,6 +43,8 @@ _TO_RAS = {  # by the words of `space`
     **dict.fromkeys(("left-posterior-superior", "lps"), (-1.0, -1.0, 1.0)),
 }
 _MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}  # of NIfTI, by nibabel's words
+_TRANSFORM_PARAMETERS = ("FixedParameters", "Parameters")
+_GRID_TRANSFORM = re.compile(r"(Inverse)?DisplacementFieldTransform_(float|double)_3_3")  # the inverse is Slicer's
 _ZLIB_OR_GZIP = 47  # zlib's window bits for either kind of header
 
 
@@ -86,11 +89,12 @@ _INTENT_DISPLACEMENT = 1006  # of NIfTI-1: vectors that are in the axes of its c
 
 
 def read_vector_field(path: str | Path, axes: str | None = None, *, field: str = "field") -> VectorField:
-    """The displacements of a NIfTI file [I, J, K, 3] or [I, J, K, 1, 3], or of an NRRD file.
+    """The displacements of a NIfTI file [I, J, K, 3] or [I, J, K, 1, 3], an NRRD file, or a grid transform of ITK.
 
-    `axes`, of VECTOR_AXES: of the numbers of a vector. NRRD says it, and NIfTI whose intent is a displacement; ITK and
-    ANTs write NIfTI of the intent "vector", in LPS, which does not: there it must be given. Raises as `read_label_map`,
-    and InvalidArgument where the axes are not known, or given otherwise than the file says.
+    `axes`, of VECTOR_AXES: of the numbers of a vector. NRRD says it, and NIfTI whose intent is a displacement;
+    transforms are in LPS. ITK and ANTs write NIfTI of the intent "vector", in LPS, which does not say it: there it must
+    be given. Raises as `read_label_map`, and InvalidArgument where the axes are not known, or given otherwise than the
+    file says, and for other transforms than one grid.
     """
     values, affine, said = _read(path, field, vectors=True)
     if axes is None and said is None:
@@ -113,15 +117,17 @@ _Read: TypeAlias = tuple[npt.NDArray[Any], FloatArray, str | None]  # values, vo
 
 def _read(path: str | Path, field: str, *, vectors: bool) -> _Read:
     path = Path(path)
-    if not path.name.endswith(LABEL_MAP_SUFFIXES):
-        *most, last = LABEL_MAP_SUFFIXES
+    suffixes = VECTOR_FIELD_SUFFIXES if vectors else LABEL_MAP_SUFFIXES
+    if not path.name.endswith(suffixes):
+        *most, last = suffixes
         raise InvalidArgument(f"{field} must end in {', '.join(most)} or {last}, got {path.name!r}", field=field)
+    others = {".nrrd": ("NRRD", _read_nrrd), ".h5": ("HDF5", _read_hdf5), ".tfm": ("a transform", _read_tfm)}
+    kind, read = others.get(path.suffix, ("NIfTI", _read_nifti))
     try:
-        return (_read_nrrd if path.name.endswith(".nrrd") else _read_nifti)(path, field, vectors)
+        return read(path, field, vectors)
     except (InvalidArgument, ExtraMissing):
         raise
     except Exception as error:  # nibabel raises whatever the reading of a damaged file meets
-        kind = "NRRD" if path.name.endswith(".nrrd") else "NIfTI"
         reason = str(error).replace(str(path), path.name)  # not where a service keeps it
         raise InvalidArgument(f"{path.name} cannot be read as {kind}: {reason}", field=field) from None
 
@@ -188,6 +194,51 @@ def _read_nrrd(path: Path, field: str, vectors: bool) -> _Read:
         if "measurement frame" in fields:  # the axes of the vectors, in those of `space`
             values = values @ _vectors_in(fields["measurement frame"])
     return values, affine, space
+
+
+def _read_hdf5(path: Path, field: str, _: bool) -> _Read:
+    try:
+        import h5py
+    except ImportError as error:
+        raise missing_extra(error, "reading transforms", field=field) from error
+    with h5py.File(path, "r") as file:
+        transforms = list(file["TransformGroup"].values())
+        _check_grid([one["TransformType"].asstr()[0] for one in transforms], field)
+        (one,) = transforms
+        # ITK before 5 wrote "Tranform"
+        fixed, vectors = (one.get(f"Transform{name}") or one[f"Tranform{name}"] for name in _TRANSFORM_PARAMETERS)
+        if any(one.file != file or one.is_virtual or one.external for one in (fixed, vectors)):
+            raise ValueError("its parameters must lie in the file itself")
+        return _grid(fixed, vectors, field)
+
+
+def _read_tfm(path: Path, field: str, _: bool) -> _Read:
+    lines = (line.partition(": ") for line in path.read_text(encoding="utf-8").splitlines())
+    pairs = [(key, value.strip()) for key, colon, value in lines if colon]
+    _check_grid([value for key, value in pairs if key == "Transform"], field)
+    fixed, vectors = (np.array(dict(pairs)[name].split(), np.float64) for name in _TRANSFORM_PARAMETERS)
+    return _grid(fixed, vectors, field)
+
+
+def _check_grid(kinds: Sequence[str], field: str) -> None:
+    if len(kinds) != 1 or _GRID_TRANSFORM.fullmatch(kinds[0]) is None:
+        raise InvalidArgument(
+            f"{field} must be one grid transform (DisplacementFieldTransform_double_3_3), it is "
+            f"{', '.join(kinds) or 'none'}: Slicer's module Transforms converts others",
+            field=field,
+        )
+
+
+def _grid(fixed: Any, vectors: Any, field: str) -> _Read:  # [18], [3·I·J·K]
+    """A grid by its size, origin, spacing, and direction row by row; and its vectors, x fastest. All is in LPS."""
+    size, origin, spacing, direction = np.split(np.asarray(fixed, np.float64), [3, 6, 9])
+    i, j, k = size.astype(int).tolist()
+    _check_volume((i, j, k, 3), field, vectors=True)
+    if vectors.shape != (3 * i * j * k,):
+        raise ValueError(f"it holds {vectors.size} of {3 * i * j * k} numbers")
+    affine = np.eye(4)
+    affine[:3] = np.column_stack([direction.reshape(3, 3) * spacing, origin]) * np.array(_TO_RAS["lps"])[:, None]
+    return np.asarray(vectors, np.float64).reshape(k, j, i, 3).transpose(2, 1, 0, 3), affine, "lps"
 
 
 def _vectors_in(text: str) -> FloatArray:  # [N, 3]

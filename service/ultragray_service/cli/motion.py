@@ -10,7 +10,7 @@ import numpy as np
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.registration import load_registration
 from ultragray.scene.info import read_header
-from ultragray.scene.label_maps import LABEL_MAP_SUFFIXES, VECTOR_AXES, read_vector_field
+from ultragray.scene.label_maps import VECTOR_AXES, VECTOR_FIELD_SUFFIXES, read_vector_field
 from ultragray.scene.motion_settings import AUTO, FIELD_LEADS, MotionSettings
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
@@ -47,7 +47,7 @@ def motion(
     ] = None,
     field: Annotated[
         Path | None,
-        option(f"A vector in mm for each voxel ({', '.join(LABEL_MAP_SUFFIXES)}), of a number of 1.", panel=_FIELD),
+        option(f"A vector in mm for each voxel ({', '.join(VECTOR_FIELD_SUFFIXES)}), of a number of 1.", panel=_FIELD),
     ] = None,
     field_leads: Annotated[
         str | None,

@@ -2,6 +2,7 @@
 
 import math
 
+import h5py
 import nibabel
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.learn.motion import add_motion
 from ultragray.learn.motion_fields import field_of_voxels, pulsation, vessel_of, with_mode
 from ultragray.scene.info import SceneInfo
-from ultragray.scene.label_maps import VectorField, read_vector_field
+from ultragray.scene.label_maps import VectorField, read_label_map, read_vector_field
 from ultragray.scene.modes import Mode
 from ultragray.scene.motion_settings import MotionSettings
 from ultragray.scene.shapes import LabelShape, SphereShape, TubeShape
@@ -83,16 +84,22 @@ def test_a_field_that_folds_is_not_inverted(scene):
         field_of_voxels(VectorField(vectors, AFFINE), scene.info, "both")
 
 
-@pytest.mark.parametrize("name", ["field.nrrd", "field.nii.gz"])
-def test_the_displacements_that_itk_writes_are_read(tmp_path, name):
-    lps = np.array([-1.0, -1.0, 1.0])
-    vectors = np.random.default_rng(0).normal(size=(*SHAPE, 3))  # RAS
-    image = SimpleITK.GetImageFromArray((vectors * lps).transpose(2, 1, 0, 3), isVector=True)
+LPS = np.array([-1.0, -1.0, 1.0])  # of RAS, and back
+
+
+def image_of(vectors):  # [I, J, K, 3] RAS, at AFFINE
+    image = SimpleITK.GetImageFromArray((vectors * LPS).transpose(2, 1, 0, 3), isVector=True)
     spacing = np.linalg.norm(AFFINE[:3, :3], axis=0)
     image.SetSpacing(spacing.tolist())
-    image.SetDirection((lps[:, None] * AFFINE[:3, :3] / spacing).ravel().tolist())
-    image.SetOrigin((lps * AFFINE[:3, 3]).tolist())
-    SimpleITK.WriteImage(image, tmp_path / name)
+    image.SetDirection((LPS[:, None] * AFFINE[:3, :3] / spacing).ravel().tolist())
+    image.SetOrigin((LPS * AFFINE[:3, 3]).tolist())
+    return image
+
+
+@pytest.mark.parametrize("name", ["field.nrrd", "field.nii.gz"])
+def test_the_displacements_that_itk_writes_are_read(tmp_path, name):
+    vectors = np.random.default_rng(0).normal(size=(*SHAPE, 3))  # RAS
+    SimpleITK.WriteImage(image_of(vectors), tmp_path / name)
     found = read_vector_field(tmp_path / name, None if name.endswith("nrrd") else "lps")
     np.testing.assert_allclose(found.vectors, vectors, atol=1e-6)
     np.testing.assert_allclose(found.affine, AFFINE, atol=1e-5)
@@ -103,13 +110,86 @@ def test_the_displacements_that_itk_writes_are_read(tmp_path, name):
             (tmp_path / name).read_bytes().replace(b"kinds:", b"measurement frame: (0,1,0) (-1,0,0) (0,0,1)\nkinds:")
         )
         (tmp_path / name).write_bytes(measured)
-        turned = (vectors * lps) @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) * lps
+        turned = (vectors * LPS) @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) * LPS
         np.testing.assert_allclose(read_vector_field(tmp_path / name).vectors, turned, atol=1e-6)
     else:
         with pytest.raises(
             InvalidArgument, match="does not say in which axes its vectors are: ras or lps must be given"
         ):
             read_vector_field(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["field.h5", "field.tfm"])
+def test_a_grid_transform_is_the_field_that_itk_wrote(tmp_path, name):
+    vectors = np.random.default_rng(0).normal(size=(4, 5, 6, 3))
+    transform = SimpleITK.DisplacementFieldTransform(image_of(vectors))
+    SimpleITK.WriteTransform(transform, tmp_path / name)
+    found = read_vector_field(tmp_path / name)
+    image = nibabel.Nifti1Image(vectors, AFFINE)
+    image.header.set_intent(1006)
+    nibabel.save(image, tmp_path / "field.nii")
+    same = read_vector_field(tmp_path / "field.nii")
+    np.testing.assert_allclose(found.vectors, same.vectors, atol=1e-9)
+    np.testing.assert_allclose(found.affine, same.affine, atol=1e-5)
+    at = (AFFINE @ [1.3, 2.6, 3.2, 1.0])[:3]
+    moved = np.array(transform.TransformPoint((at * LPS).tolist())) * LPS
+    field = field_of_voxels(found, SceneInfo(bounds_min_mm=tuple(at - 1.0), bounds_max_mm=tuple(at + 1.0)), "from-rest")
+    np.testing.assert_allclose(at + field(torch.from_numpy(at)[None])[0].numpy(), moved, atol=1e-6)
+    with pytest.raises(InvalidArgument, match="says that its vectors are lps, not ras"):
+        read_vector_field(tmp_path / name, "ras")
+
+
+def test_a_grid_transform_of_old_itk_and_of_slicer_is_read(tmp_path):
+    vectors = np.random.default_rng(0).normal(size=(4, 5, 6, 3))
+    path = tmp_path / "field.h5"
+    SimpleITK.WriteTransform(SimpleITK.DisplacementFieldTransform(image_of(vectors)), path)
+    with h5py.File(path, "r+") as file:
+        group = file["TransformGroup/0"]
+        for name in ("Parameters", "FixedParameters"):
+            group.move(f"Transform{name}", f"Tranform{name}")
+        del group["TransformType"]
+        group["TransformType"] = ["InverseDisplacementFieldTransform_double_3_3"]
+    np.testing.assert_allclose(read_vector_field(path).vectors, vectors, atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".tfm"])
+def test_other_transforms_are_refused_by_their_names(tmp_path, suffix):
+    path = tmp_path / f"other{suffix}"
+    grid = SimpleITK.DisplacementFieldTransform(image_of(np.zeros((4, 5, 6, 3))))
+    splines = SimpleITK.BSplineTransform(3)
+    for transform, name in (
+        (splines, "it is BSplineTransform_double_3_3: Slicer's module Transforms converts others"),
+        (SimpleITK.CompositeTransform([SimpleITK.AffineTransform(3), grid]), "AffineTransform_double_3_3, Disp"),
+    ):
+        SimpleITK.WriteTransform(transform, path)
+        with pytest.raises(InvalidArgument, match=name):
+            read_vector_field(path)
+    path.write_bytes(b"#Insight Transform File V1.0\n")
+    with pytest.raises(InvalidArgument, match=r"cannot be read as HDF5|it is none"):
+        read_vector_field(path)
+    with pytest.raises(InvalidArgument, match=r"must end in \.nii, \.nii\.gz or \.nrrd, got"):
+        read_label_map(path)
+
+
+def test_a_grid_transform_without_all_its_numbers_is_refused(tmp_path):
+    path = tmp_path / "field.tfm"
+    SimpleITK.WriteTransform(SimpleITK.DisplacementFieldTransform(image_of(np.zeros((4, 5, 6, 3)))), path)
+    path.write_text(path.read_text().replace("FixedParameters: 4 ", "FixedParameters: 5 "))
+    with pytest.raises(InvalidArgument, match="cannot be read as a transform: it holds 360 of 450 numbers"):
+        read_vector_field(path)
+
+
+def test_a_transform_whose_parameters_lie_in_another_file_is_refused(tmp_path):
+    for name in ("linked.h5", "other.h5"):
+        SimpleITK.WriteTransform(
+            SimpleITK.DisplacementFieldTransform(image_of(np.zeros((4, 5, 6, 3)))), tmp_path / name
+        )
+    with h5py.File(tmp_path / "linked.h5", "r+") as file:
+        del file["TransformGroup/0/TransformParameters"]
+        other = h5py.ExternalLink("other.h5", "TransformGroup/0/TransformParameters")
+        file["TransformGroup/0/TransformParameters"] = other
+    with pytest.raises(InvalidArgument, match="must lie in the file itself"):
+        read_vector_field(tmp_path / "linked.h5")
 
 
 def test_nifti_that_says_displacement_is_in_its_own_axes(tmp_path):
