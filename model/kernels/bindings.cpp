@@ -3,8 +3,8 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -65,14 +65,14 @@ Outputs planes_of(const std::array<OptionalPlanes, 6>& arrays, size_t count, int
     return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5], nullptr, nullptr, 0.0f};
 }
 
-using FieldArrays =
-    std::vector<std::pair<nb::ndarray<const float, nb::shape<-1, -1, -1, -1, 3>, nb::c_contig, nb::device::cpu>,
-                          nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>>>;
+using FieldArrays = std::vector<
+    std::tuple<nb::ndarray<const float, nb::shape<-1, -1, -1, -1, 3>, nb::c_contig, nb::device::cpu>,
+               nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>, std::array<double, 3>>>;
 
-// Coefficients [C or 1, X, Y, Z, 3] and maps to the grid [C or 1, 3, 4] of each displacement.
+// Coefficients [C or 1, X, Y, Z, 3] and maps to the grid [C or 1, 3, 4] of each displacement, and the scene's centre: mm.
 Displacements displacements_of(const FieldArrays& arrays, size_t count) {
     Displacements found;
-    for (const auto& [coefficients, to_grid] : arrays) {
+    for (const auto& [coefficients, to_grid, centre_mm] : arrays) {
         const size_t fields = coefficients.shape(0), places = to_grid.shape(0);
         if ((fields != 1 && fields != count) || (places != 1 && places != count))
             throw std::invalid_argument("there must be one displacement, or one for each pose");
@@ -80,7 +80,8 @@ Displacements displacements_of(const FieldArrays& arrays, size_t count) {
                          to_grid.data(),
                          {int(coefficients.shape(1)), int(coefficients.shape(2)), int(coefficients.shape(3))},
                          fields != 1,
-                         places != 1});
+                         places != 1,
+                         centre_mm});
     }
     return found;
 }

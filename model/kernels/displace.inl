@@ -29,6 +29,11 @@ inline Taps taps_at(Doubles coordinate, int size) {
             __builtin_convertvector(cell, Ints) - 1};
 }
 
+inline Doubles coordinate_of(const double to_grid[4], const Doubles x[3]) {
+    return splat_double(to_grid[0]) * x[0] + splat_double(to_grid[1]) * x[1] + splat_double(to_grid[2]) * x[2] +
+           splat_double(to_grid[3]);
+}
+
 // A field at points: where its taps are, the displacement, and the gradient of the map x -> x + u(x).
 struct Fielded {
     Taps taps[3];
@@ -44,10 +49,7 @@ inline void set_identity(Floats map[3][3]) {
 // along the third, which lie side by side.
 inline void field_at(const Field& field, const Doubles x[3], int count, Fielded& at) {
     constexpr int parts = 4 * 4 / kLanes;  // vectors that hold four taps
-    for (int a = 0; a < 3; ++a) {
-        const double* row = field.to_grid[a];
-        at.taps[a] = taps_at(row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3], field.size[a]);
-    }
+    for (int a = 0; a < 3; ++a) at.taps[a] = taps_at(coordinate_of(field.to_grid[a], x), field.size[a]);
     const Taps &i = at.taps[0], &j = at.taps[1], &k = at.taps[2];
     const int64_t across = field.place(1, 0, 0), along = field.place(0, 1, 0);
     float found[4][3][kLanes]{};  // u, and its slopes by the grid coordinates
@@ -56,6 +58,7 @@ inline void field_at(const Field& field, const Doubles x[3], int count, Fielded&
         float sums[3][4 * 4];
         for (int part = 0; part < parts; ++part) {
             Floats sum{}, by_i{}, by_j{};
+#pragma GCC unroll 1  // four planes at once have more weights than there are registers
             for (int p = 0; p < 4; ++p) {
                 Floats plane{}, plane_by_j{};
                 for (int q = 0; q < 4; ++q) {

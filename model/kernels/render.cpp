@@ -15,6 +15,7 @@ namespace ultragray {
 namespace {
 
 constexpr int64_t kClustersPerTask = 128;
+constexpr float kMmPerCm = 10;
 constexpr int kPosesAtOnce = 8;                    // bounds the memory that slices take
 constexpr int64_t kPixelsBetweenChecks = 1 << 21;  // of the flag that ends a rendering: at most some 10 ms
 
@@ -172,11 +173,16 @@ class Fields {
     void add(const Displacement& one, int pose) {
         Field field{};
         std::copy_n(one.size, 3, field.size);
-        std::copy_n(one.to_grid + (one.has_many_places ? 12 * pose : 0), 12, &field.to_grid[0][0]);
+        const double* row = one.to_grid + (one.has_many_places ? 12 * pose : 0);
+        for (int a = 0; a < 3; ++a, row += 4) {
+            field.to_grid[a][3] = row[3];
+            for (int d = 0; d < 3; ++d)
+                field.to_grid[a][d] = row[d] * kMmPerCm, field.to_grid[a][3] += row[d] * one.centre_mm[d];
+        }
         const int64_t floats = one.floats();
         std::vector<float> packed(floats / 3 * 4);
         const float* from = one.coefficients + (one.has_many ? floats * pose : 0);
-        for (int64_t i = 0; i < floats / 3; ++i) std::copy_n(from + 3 * i, 3, &packed[4 * i]);
+        for (int64_t i = 0; i < floats; ++i) packed[i / 3 * 4 + i % 3] = from[i] / kMmPerCm;
         field.coefficients = packed.data();
         packed_.push_back(std::move(packed));
         fields_.push_back(field);
@@ -231,7 +237,7 @@ class FieldGradients {
             const Displacement& one = displacements_[place % out_.size()];
             const int64_t pose = int64_t(place / out_.size()) % poses_;
             float* to = out_[place % out_.size()] + (one.has_many ? pose * one.floats() : 0);
-            for (int64_t i = 0; i < one.floats(); ++i) to[i] += gradients_[place][i / 3 * 4 + i % 3];
+            for (int64_t i = 0; i < one.floats(); ++i) to[i] += gradients_[place][i / 3 * 4 + i % 3] / kMmPerCm;
         }
     }
 

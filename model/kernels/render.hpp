@@ -1,6 +1,7 @@
 // Frames of many poses on many threads.
 #pragma once
 
+#include <array>
 #include <limits>
 #include <memory>
 #include <string>
@@ -21,12 +22,13 @@ struct ProbeGeometry {
     bool uncut = false;  // Gaussians count wherever their means lie
 };
 
-// A displacement of tissue (`Field`), the same for all poses or another for each.
+// A displacement of tissue (`Field`) in the sweep's frame, the same for all poses or another for each.
 struct Displacement {
-    const float* coefficients;  // [C or 1, X, Y, Z, 3] cm
-    const double* to_grid;      // [C or 1, 3, 4]
+    const float* coefficients;  // [C or 1, X, Y, Z, 3] mm
+    const double* to_grid;      // [C or 1, 3, 4] of x, y, z, 1 in mm
     int size[3];
-    bool has_many, has_many_places;  // C of them
+    bool has_many, has_many_places;   // C of them
+    std::array<double, 3> centre_mm;  // of the scene
     int64_t floats() const { return int64_t(3) * size[0] * size[1] * size[2]; }
 };
 using Displacements = std::vector<Displacement>;  // one after another, at most kMaxFields

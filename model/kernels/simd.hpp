@@ -28,7 +28,22 @@ typedef double Doubles __attribute__((vector_size(kLanes * sizeof(double))));
 typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
 
 inline Floats splat(float x) { return x - Floats{}; }
-inline Doubles splat_double(double x) { return x - Doubles{}; }
+// Register by register: a vector that is longer than one, GCC 12 may fill by way of memory, number by number.
+inline Doubles splat_double(double x) {
+    typedef double Register __attribute__((vector_size(sizeof(Floats))));
+    const Register half = x - Register{};
+    Doubles whole;
+    std::memcpy(&whole, &half, sizeof half);
+    std::memcpy(reinterpret_cast<char*>(&whole) + sizeof half, &half, sizeof half);
+    return whole;
+}
+template <class Reals>
+inline Reals splat_any(double x) {
+    if constexpr (std::is_same_v<Reals, Doubles>)
+        return splat_double(x);
+    else
+        return splat(static_cast<float>(x));
+}
 template <class Reals>
 inline Floats to_floats(Reals x) {
     return __builtin_convertvector(x, Floats);

@@ -137,7 +137,8 @@ inline Placed<Reals> place(const SceneView& scene, const View& view, const Candi
     for (int d = 0; d < 3; ++d) offset[d] -= view.origin[d];
     for (int d = 0; d < 3; ++d) p.offset[d] = convert(offset[d]);
     for (int d = 0; d < 3; ++d)
-        p.mu[d] = convert(view.axes[d][0] * offset[0] + view.axes[d][1] * offset[1] + view.axes[d][2] * offset[2]);
+        p.mu[d] = convert(splat_double(view.axes[d][0]) * offset[0] + splat_double(view.axes[d][1]) * offset[1] +
+                          splat_double(view.axes[d][2]) * offset[2]);
 
     for (int d = 0; d < 4; ++d) p.quat[d] = convert(load<Floats>(quat[d]));
     const Reals w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
@@ -152,8 +153,8 @@ inline Placed<Reals> place(const SceneView& scene, const View& view, const Candi
             for (int d = 0; d < 3; ++d)
                 own[d] = p.map[d][0] * p.axes[0][k] + p.map[d][1] * p.axes[1][k] + p.map[d][2] * p.axes[2][k];
         for (int d = 0; d < 3; ++d) {
-            const Lane<Reals> along[3] = {Lane<Reals>(view.axes[d][0]), Lane<Reals>(view.axes[d][1]),
-                                          Lane<Reals>(view.axes[d][2])};
+            const Reals along[3] = {splat_any<Reals>(view.axes[d][0]), splat_any<Reals>(view.axes[d][1]),
+                                    splat_any<Reals>(view.axes[d][2])};
             p.spoke[k][d] = p.scale[k] * (along[0] * own[0] + along[1] * own[1] + along[2] * own[2]);
         }
         const Reals* s = p.spoke[k];
@@ -261,43 +262,53 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     out.shrink_by(room - written);
 }
 
-// Bounds of a field within so much of a point.
-inline Layer layer_about(const Field& field, const Doubles point[3], float radius) {
-    const double* row = field.to_grid[2];
-    const double at = row[0] * point[0][0] + row[1] * point[1][0] + row[2] * point[2][0] + row[3];
-    const double room = radius * __builtin_sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]);
-    const auto cell = [most = field.size[2] - 4](double coordinate) {
-        return coordinate < 2 ? 0 : coordinate < most + 1 ? static_cast<int>(coordinate) - 1 : most;
+// Bounds of a field within so much of a coordinate along the third axis of its grid.
+inline Layer layer_about(const Field& field, double coordinate, double room) {
+    const auto cell = [most = field.size[2] - 4](double at) {
+        return at < 2 ? 0 : at < most + 1 ? static_cast<int>(at) - 1 : most;
     };
-    Layer layer = field.layers[cell(at - room)];
-    for (int k = cell(at - room) + 1; k <= cell(at + room); ++k) layer.widen(field.layers[k]);
+    Layer layer = field.layers[cell(coordinate - room)];
+    for (int k = cell(coordinate - room) + 1; k <= cell(coordinate + room); ++k) layer.widen(field.layers[k]);
     return layer;
 }
 
-// Of the displacement of a cluster's means: the centre's tells it to first order.
-inline Layer displacement_of(const View& view, const Cluster& cluster) {
-    Doubles x[3];
-    float squares = 0, steepest = 1, moved = 0;
-    for (int d = 0; d < 3; ++d) {
-        x[d] = splat_double(cluster.centre[d]);
-        squares += cluster.half[d] * cluster.half[d];
+// Of the displacement of the means of up to kLanes clusters: that of each centre tells it to first order.
+inline void displacements_of(const SceneView& scene, const View& view, const Candidates& clusters, Layer bounds[kLanes]) {
+    float centre[3][kLanes], radius[kLanes], steepest = 1;
+    for (int k = 0; k < kLanes; ++k) {
+        const Cluster& cluster = scene.clusters[clusters.ids[k < clusters.count ? k : 0]];
+        float squares = 0;
+        for (int d = 0; d < 3; ++d) centre[d][k] = cluster.centre[d], squares += cluster.half[d] * cluster.half[d];
+        radius[k] = __builtin_sqrtf(squares), bounds[k] = {};
     }
-    const float radius = __builtin_sqrtf(squares);
-    Layer all{};
+    Doubles x[3];
+    for (int d = 0; d < 3; ++d) x[d] = __builtin_convertvector(load<Floats>(centre[d]), Doubles);
     for (int f = 0; f < view.field_count; ++f) {
-        const Layer layer = layer_about(view.fields[f], x, steepest * radius);
-        all.least += layer.least, all.most += layer.most;
-        all.gradient = steepest * (1 + layer.gradient) - 1, all.stretch = steepest * layer.stretch;
-        steepest *= view.fields[f].steepest;
+        const Field& field = view.fields[f];
+        const double* row = field.to_grid[2];
+        const double per_cm = __builtin_sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]);
+        double depths[kLanes];
+        store(depths, coordinate_of(row, x));
+        for (int k = 0; k < clusters.count; ++k) {
+            const Layer layer = layer_about(field, depths[k], steepest * radius[k] * per_cm);
+            bounds[k].least += layer.least, bounds[k].most += layer.most;
+            bounds[k].gradient = steepest * (1 + layer.gradient) - 1, bounds[k].stretch = steepest * layer.stretch;
+        }
+        steepest *= field.steepest;
         Fielded at;
-        field_at(view.fields[f], x, 1, at);
+        field_at(field, x, clusters.count, at);
         move(x, at);
     }
-    for (int d = 0; d < 3; ++d) moved += float(view.axes[1][d]) * static_cast<float>(x[d][0] - cluster.centre[d]);
-    const float room = all.gradient * radius;
-    all.least = all.least < moved - room ? moved - room : all.least;
-    all.most = moved + room < all.most ? moved + room : all.most;
-    return all;
+    Doubles along{};
+    for (int d = 0; d < 3; ++d)
+        along += splat_double(view.axes[1][d]) * (x[d] - __builtin_convertvector(load<Floats>(centre[d]), Doubles));
+    float moved[kLanes];
+    store(moved, to_floats(along));
+    for (int k = 0; k < clusters.count; ++k) {
+        const float room = bounds[k].gradient * radius[k];
+        bounds[k].least = bounds[k].least < moved[k] - room ? moved[k] - room : bounds[k].least;
+        bounds[k].most = moved[k] + room < bounds[k].most ? moved[k] + room : bounds[k].most;
+    }
 }
 
 template <bool thick, bool displaced>
@@ -312,25 +323,18 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
     const auto reach_of = [beam_reach2](float reach) {
         return thick ? __builtin_sqrtf(reach * reach + beam_reach2) : reach;
     };
-    Candidates found;
-    for (int64_t i = first; i < last; ++i) {
+    const auto is_off = [&](int64_t i, const Layer& moved) {
         const Cluster& cluster = scene.clusters[i];
         float distance = 0, extent = slack;
         for (int d = 0; d < 3; ++d) {
             distance += ny[d] * (cluster.centre[d] - o[d]);
             extent += __builtin_fabsf(ny[d]) * cluster.half[d];
         }
-        Layer moved{0, 0, 0, 1};
-        const auto is_off = [&] {
-            const float all = extent + reach_of(moved.stretch * cluster.reach);
-            return distance + moved.most < -all || distance + moved.least > all;
-        };
-        if constexpr (displaced) {
-            moved = view.displaced;
-            if (is_off()) continue;
-            moved = displacement_of(view, cluster);
-        }
-        if (is_off()) continue;
+        extent += reach_of(moved.stretch * cluster.reach);
+        return distance + moved.most < -extent || distance + moved.least > extent;
+    };
+    Candidates found;
+    const auto slice_cluster = [&](int64_t i, const Layer& moved) {
         const float middle = 0.5f * (moved.least + moved.most), doubt = slack + 0.5f * (moved.most - moved.least);
         const int64_t begin = i * kClusterSize;
         const int64_t end = begin + kClusterSize < scene.count ? begin + kClusterSize : scene.count;
@@ -344,6 +348,22 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
                 slice_candidates<thick, displaced>(scene, view, found, out);
                 found.count = 0;
             }
+        }
+    };
+    Candidates near{};  // clusters
+    for (int64_t i = first; i < last; ++i) {
+        if constexpr (!displaced) {
+            constexpr Layer still{0, 0, 0, 1};
+            if (!is_off(i, still)) slice_cluster(i, still);
+        } else {
+            near.ids[near.count] = i;
+            near.count += !is_off(i, view.displaced);
+            if (near.count < kLanes && i + 1 < last) continue;
+            Layer moved[kLanes];
+            displacements_of(scene, view, near, moved);
+            for (int k = 0; k < near.count; ++k)
+                if (!is_off(near.ids[k], moved[k])) slice_cluster(near.ids[k], moved[k]);
+            near.count = 0;
         }
     }
     if (found.count > 0) slice_candidates<thick, displaced>(scene, view, found, out);

@@ -244,7 +244,7 @@ void View::draw(const Sight& sight, const Lines& lines, int threads, Planes& pla
     ultragray::render(*scene_->scene.gaussians, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
                       {at(planes.bmode), at(planes.echo), at(planes.transmittance), at(planes.coverage), nullptr, nullptr,
                        nullptr, nullptr, 0.0f},
-                      {}, lines, sight.displacements());
+                      {}, lines, sight.displacements(scene_->scene.info.centre_mm));
 }
 
 void View::draw(const double* pose, int first_line, int end_line, float* drawn) const {
@@ -328,17 +328,12 @@ void View::press(Sight& sight) const {
     if (sum == 0.0 && needles.empty()) return;
     sight.pressed = press_->at(sight.at_rest.matrix().data(), depths.data(), width_, needles);
     sight.force_n = sight.pressed->force_n;
-    for (float& one : sight.pressed->coefficients) one /= 10.0f;
-    for (int a = 0; a < 3; ++a) {
-        double* row = &sight.pressed->to_grid[4 * a];
-        for (int d = 0; d < 3; ++d) row[3] += row[d] * scene_->scene.info.centre_mm[d], row[d] *= 10.0;
-    }
 }
 
-Displacements Sight::displacements() const {
+Displacements Sight::displacements(const Vector& centre_mm) const {
     if (!pressed) return {};
     const auto& [coefficients, size, to_grid, force] = *pressed;
-    return {{coefficients.data(), to_grid.data(), {size[0], size[1], size[2]}, false, false}};
+    return {{coefficients.data(), to_grid.data(), {size[0], size[1], size[2]}, false, false, centre_mm}};
 }
 
 // Room for the planes that the outputs follow from, and for those that tools, ghosts and confidence do.
@@ -447,7 +442,7 @@ std::vector<float> View::labels(const Sight& sight, int threads) const {
     for (const auto& [label, part] : scene_->scene.parts) {
         ultragray::render(*part, sight.geometry, sight.matrix, 1, height_, width_, threads, "auto",
                           {nullptr, nullptr, nullptr, nullptr, weight.data(), nullptr, nullptr, nullptr, 0.0f}, {}, {},
-                          sight.displacements());
+                          sight.displacements(scene_->scene.info.centre_mm));
         for (size_t k = 0; k < size; ++k)
             if (weight[k] > heaviest[k] && weight[k] >= kLeastWeightSum) heaviest[k] = weight[k], found[k] = float(label);
     }

@@ -46,10 +46,10 @@ struct Sight {
     ProbeGeometry geometry;
     double matrix[16];
     std::optional<Touch> touch;      // none: contact is assumed
-    std::optional<Pressed> pressed;  // none: no tissue is displaced; in cm about the scene's centre
+    std::optional<Pressed> pressed;  // none: no tissue is displaced
     double indentation_mm = std::nan("");
     double force_n = std::nan("");
-    Displacements displacements() const;
+    Displacements displacements(const Vector& centre_mm) const;
 };
 
 // Settings of frames of one scene, checked and completed, and all of them that does not depend on the pose.

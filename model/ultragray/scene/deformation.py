@@ -87,7 +87,7 @@ class Displacement:
         return Displacement(one_each, self.to_grid if len(self.to_grid) == 1 else self.to_grid[poses])
 
     def in_cm(self, centre_mm: Sequence[float]) -> Displacement:
-        """The same in cm about a scene's centre, as backends take it."""
+        """The same in cm about a scene's centre, as the reference takes it."""
         to_grid = 10.0 * self.to_grid
         to_grid[:, :, 3] = self.to_grid[:, :, 3] + self.to_grid[:, :, :3] @ np.asarray(centre_mm)
         return Displacement(self.coefficients / 10.0, to_grid)

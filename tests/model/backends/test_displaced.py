@@ -94,6 +94,26 @@ def test_no_small_gaussian_is_missed_that_goes_another_way_than_its_cluster(kern
     assert (off[lit] < 1e-2).double().mean() > 0.995
 
 
+@pytest.mark.parametrize("count", [1, 2], ids=["a field", "two fields"])
+@pytest.mark.parametrize("beam", [None, FOCUSED], ids=["thin", "thick"])
+@pytest.mark.parametrize("kernel", cpu.INSTRUCTION_SETS)
+def test_tissue_is_drawn_that_fields_bring_to_the_plane_from_out_of_its_reach(kernel, beam, count, random_scene):
+    centre = np.array([30.0, -20.0, 10.0])
+    away = {"centre_cm": (0.0, 2.5, 2.5), "extent_cm": (4.0, 1.0, 5.0), "sigma_cm": (0.02, 0.04)}
+    scene = random_scene(3000, seed=4, **away, info={"centre_mm": tuple(centre)})
+    samples = torch.randn((1, 4, 5, 6, 3), generator=torch.Generator().manual_seed(4))
+    samples[..., 1] -= 25.0
+    moved = scene.under(*[Displacement.through(samples / count, centre - (20.0, 20.0, 0.0), 14.0)] * count)
+    pose = np.eye(4)[None]
+    pose[0, :3, 3] = centre
+    assert not drawn(kernel, scene, LINEAR, pose, beam)["coverage"].any()
+    expected = drawn("reference", moved.to(torch.float64), LINEAR, pose, beam)["coverage"]
+    off = (drawn(kernel, moved, LINEAR, pose, beam)["coverage"] - expected).abs()
+    lit = expected > 0.01
+    assert lit.sum() > 200
+    assert (off[lit] < 1e-3).double().mean() > 0.995
+
+
 def test_a_field_of_one_value_is_a_probe_that_moved_the_other_way(random_scene, random_poses):
     scene, poses, shift = random_scene(200), random_poses(2), torch.tensor([3.0, -2.0, 4.0])
     shifted = poses.copy()

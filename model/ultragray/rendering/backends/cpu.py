@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -29,10 +29,10 @@ from ultragray.rendering.backends.inputs import (
 )
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
 from ultragray.rendering.outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
-from ultragray.scene.deformation import Displacement
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
+_Field: TypeAlias = tuple[npt.NDArray[np.float32], FloatArray, tuple[float, ...]]  # mm, the last the scene's centre
 
 
 def supports(scene: GaussianScene) -> bool:
@@ -64,18 +64,18 @@ def render_outputs(
             field="instruction_set",
         )
     view = {**_view_arguments(probe, as_array(poses_cm), height, width, beam), "instruction_set": instruction_set}
-    fields = scene.displacements_cm()
-    varied = [*scene.splats.values(), *(one.coefficients for one in fields), *([] if beam is None else [beam])]
+    moved = scene.displacements
+    varied = [*scene.splats.values(), *(one.coefficients for one in moved), *([] if beam is None else [beam])]
     if want_gradient(poses_cm) or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
             Kind(scene.info.intensity, weighted),
             view,
-            [one.to_grid for one in fields],
+            _fields(scene),
             tuple(outputs),
             poses_cm,
             beam,
             *scene.splats.values(),
-            *(one.coefficients for one in fields),
+            *(one.coefficients for one in moved),
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
@@ -145,18 +145,21 @@ def _draw(
             **view,
             **_arrays(planes),
             **bounds,
-            displacements=_fields(scene.displacements_cm()),
+            displacements=_fields(scene),
             **more,
         )
 
 
-def _fields(displacements: Sequence[Displacement]) -> list[tuple[npt.NDArray[np.float32], FloatArray]]:
-    """Displacements (cm) as the kernel takes them."""
-    return [(_coefficients(one.coefficients).numpy(), np.ascontiguousarray(one.to_grid)) for one in displacements]
-
-
-def _coefficients(of_any_type: Tensor) -> Tensor:
-    return of_any_type.detach().to("cpu", torch.float32).contiguous()
+def _fields(scene: GaussianScene) -> list[_Field]:
+    """The displacements of a scene as the kernel takes them."""
+    return [
+        (
+            one.coefficients.detach().to("cpu", torch.float32).contiguous().numpy(),
+            np.ascontiguousarray(one.to_grid),
+            tuple(map(float, scene.info.centre_mm)),
+        )
+        for one in scene.displacements
+    ]
 
 
 @contextmanager
@@ -192,7 +195,7 @@ def footprint_pixels(
             pixels=pixels,
             flag=limits.flag,
             number=limits.number,
-            displacements=_fields(scene.displacements_cm()),
+            displacements=_fields(scene),
         )
     return pixels.tolist()
 
@@ -255,16 +258,15 @@ class _Render(torch.autograd.Function):
         ctx: Any,
         kind: Kind,
         view: dict[str, Any],
-        to_grids: list[FloatArray],
+        fields: list[_Field],
         names: tuple[str, ...],
         poses: ScenePoses,
         beam: Tensor | None,
-        *varied: Tensor,  # raw parameters, and the coefficients of each displacement (cm)
+        *varied: Tensor,  # raw parameters, and the coefficients of each displacement
     ) -> tuple[Tensor, ...]:
         planes = _empty_planes(view, names)
         splats, coefficients = varied[: len(PARAMETERS)], varied[len(PARAMETERS) :]
         scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), kind, as_given=True)
-        fields = _fields([Displacement(*one) for one in zip(coefficients, to_grids, strict=True)])
         ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes), displacements=fields)
         ctx.fields = coefficients if any(ctx.needs_input_grad[6 + len(PARAMETERS) :]) else ()
         ctx.names, ctx.poses = names, poses
