@@ -1,5 +1,6 @@
 """The phantom: its tissues, how its images form, the poses that it is scanned from, and the shadow of its bones."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,8 @@ from ultragray.phantom import (
 )
 from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ, INTERFACES, LatticeNoise
 from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
+from ultragray.phantom.recipes import SHEETS_DB, spine_recipe
+from ultragray.scene.tissues import reflection_db
 
 from ..scripts import benchmark
 
@@ -121,6 +124,7 @@ def at(x=0.0, y=0.0, tilt_deg=0.0):
     return pose
 
 
+WITHIN_A_TISSUE = (1, 3, 6, 7, 8, 9, 13)  # of INTERFACES, those whose two sides are the same tissue
 SPINE, BESIDE, NEXT, FURTHER, TILTED = range(5)
 
 
@@ -191,6 +195,44 @@ def test_speckle_has_the_statistics_of_three_independent_looks(monkeypatch):
     assert inside.std() == pytest.approx(1.0 / np.sqrt(3.0), abs=0.06)
     upper, lower = np.array_split(inside, 2)
     assert upper.mean() == pytest.approx(lower.mean(), rel=0.15)
+
+
+def test_the_recipe_of_the_spine_reflects_where_two_tissues_meet_as_the_phantom_does():
+    acoustics = {body.label: body.acoustics for body in spine_recipe()[0].bodies}
+    found = ScattererField().slice(np.eye(4), np.array([-30.0, -1.0, 0.0]), np.array([30.0, 1.0, 60.0]))
+    above, below = (tissue_at(found.surface_mm + side * found.normals) for side in (-0.6, 0.6))
+    compared = 0
+    for first, second in itertools.combinations(acoustics, 2):
+        here = (np.minimum(above, below) == first) & (np.maximum(above, below) == second)
+        if here.sum() > 100:
+            phantom_db = 20.0 * np.log10(np.median(found.specular[here]))
+            made_db = reflection_db(acoustics[first].impedance, acoustics[second].impedance)
+            assert made_db == pytest.approx(phantom_db, abs=2.0), (Tissue(first), Tissue(second))
+            compared += 1
+    assert compared > 6
+
+
+def test_the_recipe_of_the_spine_is_as_bright_as_the_phantom_with_the_sheets_within_its_tissues():
+    silent = {"specular_db": -99.0, "diffuse_db": -99.0}
+    poses = freehand_poses(9, tilt_deg=5.0)[::4]
+    labels = tissues(poses, **SIZE)
+    bare, sheets = (
+        simulate(
+            poses,
+            **SIZE,
+            phantom=replace(
+                anatomy.SPINE,
+                interfaces=tuple(
+                    one if number in kept else replace(one, **silent) for number, one in enumerate(INTERFACES)
+                ),
+            ),
+        )
+        for kept in ((), WITHIN_A_TISSUE)
+    )
+    for tissue, expected_db in SHEETS_DB.items():
+        lit = (labels == tissue) & (bare > 0)
+        raised_db = (sheets[lit].mean() - bare[lit].mean()) / 255.0 * imaging.DYNAMIC_RANGE_DB
+        assert raised_db == pytest.approx(expected_db, abs=1.0), tissue
 
 
 def test_bone_attenuation_starts_at_the_bone_and_only_grows():

@@ -17,7 +17,7 @@ from torch import Tensor
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.editing.parts import SH_C0, Distance, clipped, harmonics_of, quaternions
-from ultragray.learn.sweep import ByteArray
+from ultragray.learn.sweep import ByteArray, IntArray
 from ultragray.learn.synthesis.beams import DARK, Losses, blurred, interpolated, losses, scan_poses
 from ultragray.learn.synthesis.space import BodySpace
 from ultragray.rendering.backends.inputs import spatial_order
@@ -33,9 +33,8 @@ LARGEST_MM = 3.0  # of a cube
 LEAST_SPACING_MM = 0.3
 SHARPNESS = 2.5  # of bodies at their surfaces, in deviations of what is clipped
 GRAIN = 3.0  # deviations of echo over that of their mean: nine Gaussians lie over each point
-SURFACE_MM = 0.15  # deviation of a surface across it: less than a pulse is long
+MOST_LAYERS = 4  # of Gaussians on a surface
 LEAST_CONTRAST_DB = 3.0  # of a surface over what is beside it
-LOBE_COSINE = 0.5  # of the angle at which a surface is no brighter than what is beside it
 OPAQUE = 1.0  # of the logarithm of two impedances' ratio: bone, gas
 SOFT_TISSUE_MRAYL = 1.63
 SPEED_MM_PER_US = 1.54
@@ -43,7 +42,13 @@ BRIGHTEST = 0.98
 MOST_BRIGHTENED = 3.0  # times its own echo, of a tissue behind fluid
 _C1 = 0.4886025119029199  # of harmonics of degree 1
 _LEAST_ALPHA = 1.0 / 255.0
+# Weights of Gaussians over a point of a surface, summed: those of bodies, one in each cube, of which clipping leaves
+# six tenths there (as measured), and those of one layer of the surface, in each cube whose middle is at most 0.75 of
+# its side from it.
+_OF_BODIES = 0.6 * (math.sqrt(2.0 * math.pi) / SPACING) ** 3
+_OF_LAYER = 1.5 * 2.0 * math.pi / SPACING**2
 _TRIES = 4  # of the size of the cubes
+_VOXEL, _BLUR = 0.4, 0.42  # of a cube's side: finer than a layer of one cube, which is lost otherwise
 
 
 def scene_from_labels(
@@ -103,7 +108,7 @@ def speckle_of(recipe: SceneRecipe) -> SpeckleModel:
     bands = depth_mm * ((np.arange(BANDS) + 0.5) / BANDS - 0.5)
     lateral = np.hypot(1.1 * wave_mm, 0.011 * bands)
     elevation = np.hypot(2.0 * wave_mm, 0.022 * bands)
-    axial = 0.55 * wave_mm
+    axial = pulse_mm(recipe)
     strength = 10.0 / math.log(10.0) * math.pi / math.sqrt(6.0) / recipe.dynamic_range_db
     return SpeckleModel(
         seed=recipe.seed,
@@ -169,9 +174,9 @@ class _Builder:
         self.info = SceneInfo(
             centre_mm=tuple(self._centre.tolist()), probe=recipe.scanner, intensity="sigmoid", sh_degree=1
         )
-        self._voxel_mm = cubes.spacing_mm / 1.5
+        self._voxel_mm = _VOXEL * cubes.spacing_mm
         shape = np.ceil((lost.high_mm - lost.low_mm) / self._voxel_mm).astype(int) + 1
-        self._blur_mm = max(0.7 * cubes.spacing_mm, 0.6 * space.resolution_mm)
+        self._blur_mm = max(_BLUR * cubes.spacing_mm, 0.6 * space.resolution_mm)
         self._voxels = np.empty(tuple(shape), np.uint8)
         for index, plane in enumerate(self._voxels):  # a plane at once bounds the memory
             j, k = (axis.ravel() for axis in np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"))
@@ -263,17 +268,25 @@ class _Builder:
         bright = (echo_db > around_db + LEAST_CONTRAST_DB) & (inwards | ~odd)
         if not bright.any():
             return None
-        places, normals = places[bright], normals[bright]
-        count = len(places)
         levels = [np.array([self._grey(float(db)) for db in each[bright]]) for each in (echo_db, around_db)]
-        facing, aside = (self._seen(grey, places)[0].clip(0.01, BRIGHTEST) for grey in levels)
-        lobe = turned(normals * np.sign(across[bright])[:, None], beams[bright], seen_along[bright])
-        # sigmoid(4·(a + b·cosine)) is `facing` at a cosine of 1 and `aside` at LOBE_COSINE
+        facing, aside = (self._seen(grey, places[bright])[0].clip(0.01, BRIGHTEST) for grey in levels)
+        layers = layers_of((facing - aside) / (BRIGHTEST - aside).clip(1e-3))
+        which = np.repeat(np.flatnonzero(bright), layers)
+        facing, aside, layers = (np.repeat(each, layers) for each in (facing, aside, layers))
+        places, normals = places[which], normals[which]
+        # Gaussians of bodies lie there, too, and show what is beside it. With their weight as 1, that of the surface
+        # falls from `over` as a Gaussian g, its share over·g/(1 + over·g) to a half where g = 1/(2 + over).
+        over = _OF_LAYER * layers / _OF_BODIES
+        facing = (aside + (facing - aside) * (1.0 + 1.0 / over)).clip(0.01, BRIGHTEST)
+        narrower = np.sqrt(math.log(2.0) / np.log(2.0 + over))
+        lobe = turned(normals * np.sign(across[which])[:, None], beams[which], seen_along[which])
+        # sigmoid(4·(a + b·cosine)) is `facing` at a cosine of 1 and `aside` at 0, where the beam runs along the surface
         logit_facing, logit_aside = (np.log(one / (1.0 - one)) / 4.0 for one in (facing, aside))
-        rise = np.maximum(logit_facing - logit_aside, 0.0) / (1.0 - LOBE_COSINE)
-        sigma = np.tile([SURFACE_MM, *2 * [self._cubes.spacing_mm / SPACING]], (count, 1))
+        rise = np.maximum(logit_facing - logit_aside, 0.0)
+        sigma = np.tile([0.0, *2 * [self._cubes.spacing_mm / SPACING]], (len(which), 1))
+        sigma[:, 0] = narrower * surface_mm(self._recipe, (echo_db - around_db)[which])
         return self._splats(
-            places, sigma, quaternions(_frames(normals)), np.zeros(count), None, lobe, logit_facing, rise
+            places, sigma, quaternions(_frames(normals)), np.zeros(len(which)), None, lobe, logit_facing, rise
         )
 
     def _beams(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm -> [N, 3] both, unit
@@ -322,6 +335,30 @@ def turned(vectors: FloatArray, before: FloatArray, after: FloatArray) -> FloatA
     share = (both * vectors).sum(axis=1, keepdims=True) / np.maximum(half, 1e-9)
     found: FloatArray = vectors - share * both + 2.0 * (before * vectors).sum(axis=1, keepdims=True) * after
     return found
+
+
+def layers_of(share: FloatArray) -> IntArray:  # [N] -> [N]
+    """How many layers of Gaussians give a surface such a share of all weights there; MOST_LAYERS at most."""
+    needed = share / (1.0 - share).clip(1e-6) * _OF_BODIES / _OF_LAYER
+    found: IntArray = np.ceil(needed).clip(1, MOST_LAYERS).astype(int)
+    return found
+
+
+def surface_mm(recipe: SceneRecipe, contrast_db: FloatArray) -> FloatArray:  # [N] -> [N]
+    """The deviation across it with which a surface shows that is so much brighter than what is beside it.
+
+    The envelope exp(−z²/2σ²) of a pulse is a parabola in decibels, which rises above what is beside it as far as
+    zₘ = σ·√(2·contrast/8.69): the brighter, the wider. A Gaussian as high and of the same area deviates by
+    4/3·zₘ/√(2π), so that a surface is as bright in the mean.
+    """
+    reach_mm = pulse_mm(recipe) * np.sqrt(np.clip(contrast_db, 0.0, recipe.dynamic_range_db) * math.log(10.0) / 10.0)
+    found: FloatArray = 4.0 / 3.0 / math.sqrt(2.0 * math.pi) * reach_mm
+    return found
+
+
+def pulse_mm(recipe: SceneRecipe) -> float:
+    """The deviation of the envelope of a pulse of one and a half waves, along depth."""
+    return 0.55 * SPEED_MM_PER_US / recipe.frequency_mhz
 
 
 def _frames(normals: FloatArray) -> FloatArray:  # [N, 3] -> [N, 3, 3] rotations whose first column is the normal

@@ -10,12 +10,13 @@ import trimesh
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import ConvexProbe
-from ultragray.learn.synthesis.scene import SPACING, opacity_of, scene_from_labels, turned
+from ultragray.learn.synthesis.scene import SPACING, opacity_of, scene_from_labels, surface_mm, turned
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.scene.label_maps import read_label_map
 from ultragray.scene.recipes import SceneRecipe, TissueBody, read_recipe
 from ultragray.scene.shapes import BoxShape, MeshShape, SphereShape, TubeShape
+from ultragray.scene.tissues import WHOLE_REFLECTION_DB
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 VIEW = {"towards": (0.0, 0.0, 1.0), "along": (0.0, 1.0, 0.0), "probe": PROBE, "sweep_mm": 12.0, "pose_count": 13}
@@ -108,6 +109,44 @@ def test_speckle_has_the_statistics_of_theory():
     ratio = amplitude.mean(axis=(0, 1, 2)) / amplitude.std(axis=(0, 1, 2))
     assert ratio == pytest.approx(math.sqrt(math.pi / (4.0 - math.pi)), rel=0.1)
     assert (60.0 * level).std() == pytest.approx(5.57, rel=0.1)
+
+
+@pytest.mark.parametrize("contrast_db", [8.0, 16.0, 28.0])
+def test_a_surface_shows_what_it_reflects_as_wide_as_its_pulse_in_decibels_and_nothing_along_the_beam(contrast_db):
+    share = 10.0 ** ((contrast_db - WHOLE_REFLECTION_DB) / 20.0)
+    tissue = {"tissue": "liver", "attenuation": 0.54}
+    ball = SphereShape(centre_mm=(0.0, 0.0, 80.0), radius_mm=60.0)
+    bodies = (
+        TissueBody(**tissue, impedance=1.6, shape=BLOCK),
+        TissueBody(**tissue, impedance=1.6 * (1.0 + share) / (1.0 - share), name="ball", shape=ball),
+    )
+    recipe = SceneRecipe(bodies=bodies, **{**SMALL, "level": 0.3})
+    scene = scene_from_labels(recipe)
+    rows, half = 1600, 160  # 40 rows a mm
+    middle = scene.training_poses[len(scene.training_poses) // 2]
+    shown = render(scene, None, middle, height=rows, width=96)["bmode"][0].numpy()
+    tops = np.rint((80.0 - np.sqrt(60.0**2 - PROBE.scan_lines(96)[0][16:80, 0] ** 2)) * 40.0).astype(int)
+    profiles = [shown[top - half : top + half, 16 + column] for column, top in enumerate(tops)]
+    raised = np.array(profiles) - np.mean([(one[:40], one[-40:]) for one in profiles])
+    contrast = contrast_db / recipe.dynamic_range_db
+    assert raised.max(axis=1).mean() == pytest.approx(contrast, rel=0.1)
+    area_mm = raised[:, half - 40 : half + 40].mean(axis=0).sum() / 40.0
+    expected_mm = math.sqrt(2.0 * math.pi) * float(surface_mm(recipe, np.array(contrast_db)))
+    assert area_mm == pytest.approx(contrast * expected_mm, rel=0.35)
+    along = middle.copy()  # from the side: in the middle of its scan lines the beam meets the top of the ball
+    along[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    along[:3, 3] = [20.0, middle[1, 3], 20.0]
+    across = render(scene, None, along, height=160, width=300)["bmode"][0, 70:90].mean(dim=0).numpy()
+    assert np.abs(across[130:170] - across[[90, 210]].mean()).max() < 0.05
+
+
+def test_a_layer_of_not_quite_two_cubes_is_shown():
+    layer = BoxShape(min_mm=(-20.0, -12.0, 10.0), max_mm=(20.0, 12.0, 12.4))
+    tissue = {"tissue": "liver", "attenuation": 0.54, "impedance": 1.6}
+    bodies = (TissueBody(**tissue, shape=BLOCK), TissueBody(**tissue, name="layer", echo_db=15.0, shape=layer))
+    scene = scene_from_labels(SceneRecipe(bodies=bodies, **{**SMALL, "level": 0.4, "gaussian_count": 4_000}))
+    shown = frame(scene, "bmode")[:, 16:80].mean(axis=1)
+    assert shown[41:49].mean() - shown[28:34].mean() > 0.4 * 15.0 / 60.0
 
 
 def test_opacity_takes_as_much_of_a_beam_as_asked_for():
