@@ -35,7 +35,7 @@ from ultragray.learn.motion_fields import (
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.losses import image_loss
 from ultragray.rendering.frames import render
-from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene, no_smaller_than_held
 from ultragray.scene.modes import Mode
 from ultragray.scene.motion_settings import FIT_STEPS, GIVEN_SPACING_MM, SPACING_MM, MotionSettings
 from ultragray.scene.shapes import LabelShape, TubeShape
@@ -292,7 +292,7 @@ class _Fit:
 
     def scene_with(self, mode: Mode, field: Tensor) -> GaussianScene:  # [1, X, Y, Z, 3] mm for one unit
         """What was learned, as a scene with one mode more."""
-        learned: dict[str, Any] = {key: tensor.detach() for key, tensor in self._splats.items()}
+        learned: dict[str, Any] = no_smaller_than_held({key: tensor.detach() for key, tensor in self._splats.items()})
         return with_splines(replace(self._scene, **learned), mode, self._grid, field[0])
 
 

@@ -350,6 +350,15 @@ class GaussianScene:
             raise scene_file_invalid(path, error) from error
 
 
+def no_smaller_than_held(splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Raw parameters in which no Gaussian is smaller than a scene can hold.
+
+    A Gaussian that has shrunk out of sight goes on shrinking in a training: the price of its size still has a gradient,
+    and steps of Adam do not get shorter with it.
+    """
+    return {**splats, "scales": splats["scales"].clamp(min=-LARGEST["scales"])}
+
+
 def _check_values(name: str, tensor: Tensor) -> None:  # [N, ...]
     """Raises InvalidArgument, naming the first Gaussian whose values cannot be rendered, and how many there are."""
     values = tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None]

@@ -52,7 +52,7 @@ from ultragray.rendering.backends.inputs import spatial_order
 from ultragray.rendering.backends.registry import choose_backend
 from ultragray.rendering.frames import render
 from ultragray.scene.confidence import ConfidenceModel, TrainingViews, predicted, terms_of
-from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene, no_smaller_than_held
 from ultragray.scene.info import SceneInfo
 
 PIXELS_PER_GAUSSIAN = 40  # fewer Gaussians than `fast` begins with: a step takes a third of the time, for 0.1 dB
@@ -177,7 +177,7 @@ class GrowingTrainer:
         )
         splats = {name: tensor.detach().cpu().clone() for name, tensor in self._parameters.items()}
         poses = {"training_poses": self._train.poses} if self._whole is None else self._whole.of_scene()
-        return GaussianScene.from_splats(splats, info=info, **poses)
+        return GaussianScene.from_splats(no_smaller_than_held(splats), info=info, **poses)
 
     def judge(self) -> Judgement:
         """Measures the scene on some held-out frames that the version shown was judged by, and on all newer ones."""

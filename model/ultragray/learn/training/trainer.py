@@ -48,7 +48,7 @@ from ultragray.learn.training.poses import PoseRefinement
 from ultragray.learn.training.progress import Board, Journal, Progress, StepTimer
 from ultragray.rendering.backends.registry import choose_backend
 from ultragray.rendering.frames import Frames, render
-from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene, no_smaller_than_held
 from ultragray.scene.info import SceneInfo, check_training_pose_count
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
@@ -388,7 +388,7 @@ class Trainer:
             training={**self.config.to_dict(), "step": self.step},
             tissue_shares=self.refinement.tissue_shares,
         )
-        scene = GaussianScene.from_splats(splats, info=info, **self.refinement.of_scene())
+        scene = GaussianScene.from_splats(no_smaller_than_held(splats), info=info, **self.refinement.of_scene())
         if len(self.dataset.val) and self.is_finished:
             measured = evaluate(scene.at_rest().to(self._device), self.dataset.val, backend=self._backend)
             scene.info.metrics.update(measured.mean.to_dict())

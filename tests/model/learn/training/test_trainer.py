@@ -29,6 +29,7 @@ from ultragray.learn.training import batch, train, trainer
 from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.run import scene_of_checkpoint
 from ultragray.scene import info as scene_info
+from ultragray.scene.gaussians import LARGEST
 
 from ..conftest import make_tiny_config, make_tiny_dataset
 
@@ -250,6 +251,18 @@ def test_neither_do_corrections_that_are_not_finite(tiny_dataset, tiny_config, t
     with pytest.raises(TrainingDiverged, match=f"{what} are no longer finite"):
         run.save_checkpoint()
     assert not (tmp_path / "checkpoint.safetensors").exists()
+
+
+def test_gaussians_that_shrank_out_of_sight_do_not_end_a_training(tiny_dataset, tiny_config, tmp_path):
+    run = trainer.Trainer(tiny_dataset(), tiny_config(), folder=tmp_path, device="cpu", backend="auto")
+    with torch.no_grad():
+        run.parameters["scales"][:3] = -25.0
+    run.scene().save(tmp_path / "scene.ugr")
+    assert bool((GaussianScene.load(tmp_path / "scene.ugr").scales[:3] == -LARGEST["scales"]).all())
+    with torch.no_grad():
+        run.parameters["scales"][3] = float("nan")
+    with pytest.raises(InvalidArgument, match="Gaussian 3"):
+        run.scene()
 
 
 def test_harmonics_are_learned_once_they_join(tiny_dataset, tiny_config):
