@@ -39,6 +39,7 @@ __all__ = [
     "EvaluateJob",
     "Extrapolation",
     "FanSampler",
+    "FieldFile",
     "FrameSettings",
     "ImageRegion",
     "Imaging",
@@ -712,11 +713,24 @@ class MotionSettings:
     # Between splines of the field. Default: 15; of a field that is given 6; of a vessel half its radius, or what
     # there is room for.
     spacing_mm: float | None = None
+    # from-rest: from a point of the tissue at rest to where it goes. to-rest: from a point of moved tissue to where
+    # it is at rest, as transforms of ITK and Slicer do that resample an image at rest.
+    field_leads: str | None = None
+    # Axes of the vectors where a NIfTI file does not say; ITK, ANTs and Slicer write lps.
+    field_axes: str | None = None
+
+
+@dataclass(frozen=True)
+class FieldFile:
+    """A file with a vector in mm for each voxel, of a number of 1."""
+
+    data: str  # The file in base64.
+    format: str = "nii.gz"  # Of the file.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionJob(MotionSettings):
-    """A scene gets a mode of motion: learned from the frames of a dataset, or built in.
+    """A scene gets a mode of motion: learned from the frames of a dataset, of a field of displacements, or built in.
 
     The scene itself stays as it is; the one that moves is served when the job has succeeded.
     """
@@ -734,6 +748,10 @@ class MotionJob(MotionSettings):
     dataset: str | None = None  # Name of the dataset that the mode is learned from.
     # One for each frame of the recording, such as a belt's reading. Default: they are found in the frames.
     numbers: tuple[float, ...] | None = None
+    field: FieldFile | None = None  # A file with a vector in mm for each voxel, of a number of 1.
+    # Leads the frame of the file into the scene's: 4x4, rigid, mm, row by row. Default: they are the same.
+    field_to_scene: tuple[float, ...] | None = None
+    registration: str | None = None  # Name of the registration whose base_to_scene does so instead.
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,11 @@ def make_service(settings: Settings) -> Service:
     catalog = SceneCatalog(scenes)
     registrations = Registrations(catalog, owners, limits)
     quotas = Quotas(limits, owners, datasets, scenes)
-    jobs = Jobs(settings, scenes, datasets, registrations.read_of_scene, quotas.admit_job)
+    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
+    # labels a scene, one edits scenes, and one draws thumbnails, which would wait behind pictures for minutes.
+    memory_bytes = settings.dataset_memory_mb << 20
+    checks, pictures, labelling, editing, thumbnails = (HelperProcesses(memory_bytes) for _ in range(5))
+    jobs = Jobs(settings, scenes, datasets, registrations.read_of_scene, quotas.admit_job, checks)
 
     pool = _pool(settings, places, metrics, tracing)
     planner = RequestPlanner(settings, catalog, registrations.of_scene)
@@ -76,10 +80,6 @@ def make_service(settings: Settings) -> Service:
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.require},
     )
-    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
-    # labels a scene, one edits scenes, and one draws thumbnails, which would wait behind pictures for minutes.
-    memory_bytes = settings.dataset_memory_mb << 20
-    checks, pictures, labelling, editing, thumbnails = (HelperProcesses(memory_bytes) for _ in range(5))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
     imports = SceneImports(scenes, places.made, means)
     return Service(

@@ -167,6 +167,29 @@ describe("a volume of a scene", () => {
   });
 });
 
+describe("a scene that moves", () => {
+  it("is made by a field of displacements of a file", async () => {
+    const page = await openPage(at, "#/train?show=jobs");
+    await page.getByText("Other jobs").click();
+    await page.getByRole("combobox", { name: "Kind", exact: true }).selectOption("motion");
+    await page.getByLabel("Into").fill("inhaled");
+    const head = [
+      "NRRD0004", "type: float", "dimension: 4", "sizes: 3 2 2 2", "space: right-anterior-superior", "encoding: raw", "endian: little",
+      "space directions: none (200,0,0) (0,200,0) (0,0,200)", "space origin: (-100,-100,-100)", "", "",
+    ].join("\n");
+    const buffer = Buffer.concat([Buffer.from(head), Buffer.alloc(96)]);
+    await page.getByLabel("Field", { exact: true }).setInputFiles({ name: "inhale.nrrd", mimeType: "application/octet-stream", buffer });
+    await page.getByRole("combobox", { name: "Field leads" }).selectOption("to-rest");
+    await picture(page, "train-motion");
+    await page.getByRole("button", { name: "Start the job" }).click();
+    await page.getByText(/^It waits for/).waitFor();
+    const [job] = (await (await fetch(`${at.service.url}/v1/jobs?kind=motion`)).json()).jobs;
+    const { scene, into, field, field_leads } = job.specification;
+    assert.deepEqual({ scene, into, format: field.format, field_leads }, { scene: "demo", into: "inhaled", format: "nrrd", field_leads: "to-rest" });
+    assert.deepEqual(page.faults, []);
+  });
+});
+
 describe("a long training", () => {
   it("asks for a thinner curve once, and goes on where that fails", async () => {
     const page = await openPage(at, "#/scenes");

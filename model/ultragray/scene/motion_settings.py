@@ -7,14 +7,26 @@ from dataclasses import dataclass
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import MAX_POSITION_MM
+from ultragray.scene.label_maps import VECTOR_AXES, VECTOR_FIELD_SUFFIXES
 from ultragray.scene.modes import Motion
-from ultragray.scene.shapes import LabelShape, Shape, TubeShape
+from ultragray.scene.shapes import LabelShape, OfFile, Shape, TubeShape
 
 FIT_STEPS = 6000  # of the fit of a mode to a sweep
 SPACING_MM, GIVEN_SPACING_MM = 15.0, 6.0  # between splines: of a field that is learned, of one that is given
 AUTO = "auto"  # in the place of a surrogate: the numbers of the frames are found
 FIELD_LEADS = ("from-rest", "to-rest")  # which way the vectors of a field lead
 MAX_MOVED_MM = 100.0  # by what is built in
+FIELD = "From a field of displacements"  # topic
+_FORMATS = tuple(suffix.removeprefix(".") for suffix in VECTOR_FIELD_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class FieldFile(OfFile, Contract):
+    """A file with a vector in mm for each voxel, of a number of 1."""
+
+    data: str = described("The file in base64.")
+    format: str = described("Of the file.", "nii.gz", choices=_FORMATS)
+    formats = _FORMATS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +54,19 @@ class MotionSettings(Contract):
         above=0.0,
         high=MAX_POSITION_MM,
     )
+    field_leads: str | None = described(
+        "from-rest: from a point of the tissue at rest to where it goes. to-rest: from a point of moved tissue to "
+        "where it is at rest, as transforms of ITK and Slicer do that resample an image at rest.",
+        None,
+        choices=FIELD_LEADS,
+        topic=FIELD,
+    )
+    field_axes: str | None = described(
+        "Axes of the vectors where a NIfTI file does not say; ITK, ANTs and Slicer write lps.",
+        None,
+        choices=VECTOR_AXES,
+        topic=FIELD,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,6 +81,11 @@ class MotionSettings(Contract):
         if sum(sources.values()) != 1:
             given = ", ".join(name for name, is_given in sources.items() if is_given) or "none"
             raise InvalidArgument(f"a mode needs exactly one of {', '.join(sources)}, got {given}", field="chest_mm")
+
+    def check_field(self, *, is_given: bool) -> None:
+        """Raises InvalidArgument unless it is told of a field, and of nothing else, which way it leads."""
+        if is_given != (self.field_leads is not None):
+            raise InvalidArgument("field and field_leads belong together", field="field_leads")
 
     def mode_name(self, motion: Motion | None) -> str:
         """The name of the mode beside those of a scene. Raises InvalidArgument where one of them has it."""

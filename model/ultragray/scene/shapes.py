@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -71,11 +71,8 @@ class Shape(Family):
         raise NotImplementedError
 
     def recorded(self) -> dict[str, Any]:
-        """The shape as a scene file tells it: of files their hash alone."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        if (data := values.get("data")) is not None:
-            values["data"] = _HASHED + sha256(data.encode()).hexdigest()
-        return values
+        """The shape as a scene file tells it."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -181,29 +178,37 @@ class TubeShape(Shape):
         return path.min(axis=0) - self.radius_mm, path.max(axis=0) + self.radius_mm
 
 
-class _OfFile:
-    """A shape of a file, which travels inside the document."""
+class OfFile:
+    """A part of a contract that is of a file, which travels inside the document. Its members have `data`."""
+
+    formats: ClassVar[tuple[str, ...]]
 
     def content(self) -> bytes:
-        data: str = self.data  # type: ignore[attr-defined]  # of its members
+        data: str = self.data  # type: ignore[attr-defined]
         try:
             return base64.b64decode(data, validate=True)
         except (ValueError, binascii.Error):
             raise InvalidArgument("data must be the file in base64", field="data") from None
 
+    def recorded(self) -> dict[str, Any]:
+        """All but the content, in whose place is its hash."""
+        part: Any = self
+        return {one.name: getattr(part, one.name) for one in fields(part)} | {
+            "data": _HASHED + sha256(part.data.encode()).hexdigest()
+        }
+
     @classmethod
     def of_file(cls, path: Path) -> dict[str, str]:
         """The data and the format of a file, by its name. Raises InvalidArgument, OSError."""
-        known: tuple[str, ...] = cls.formats  # type: ignore[attr-defined]
-        found = next((one for one in known if path.name.lower().endswith(f".{one}")), None)
+        found = next((one for one in cls.formats if path.name.lower().endswith(f".{one}")), None)
         if found is None:
-            endings = ", ".join(f".{one}" for one in known)
+            endings = ", ".join(f".{one}" for one in cls.formats)
             raise InvalidArgument(f"{path} must end in one of {endings}", field="file")
         return {"data": base64.b64encode(path.read_bytes()).decode("ascii"), "format": found}
 
 
 @dataclass(frozen=True)
-class MeshShape(_OfFile, Shape):
+class MeshShape(OfFile, Shape):
     """The inside of a closed surface of triangles."""
 
     data: str = described("A file of the mesh in base64, in mm of the scene's frame.")
@@ -258,7 +263,7 @@ class MeshShape(_OfFile, Shape):
 
 
 @dataclass(frozen=True)
-class MapShape(_OfFile, Shape):
+class MapShape(OfFile, Shape):
     """The voxels of a label in a label map. It can be cut out and relabelled, not inserted."""
 
     data: str = described("A NIfTI-1 or NRRD file in base64, in mm of the scene's frame (RAS+).")
@@ -329,6 +334,6 @@ def _with_files(document: Any, folder: Path) -> Any:
     if "file" not in inner:
         return inner
     of_kind: Any = Shape.member(inner.get("kind"))
-    if not issubclass(of_kind, _OfFile):
+    if not issubclass(of_kind, OfFile):
         raise InvalidArgument(f"file is for shapes of the kinds mesh and map, got {inner['kind']}", field="file")
     return inner | of_kind.of_file(folder / str(inner.pop("file")))

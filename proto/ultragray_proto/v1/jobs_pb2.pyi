@@ -127,7 +127,7 @@ class LiveJob(_message.Message):
     def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., recording: _Optional[str] = ..., scene: _Optional[str] = ..., version_every_s: _Optional[float] = ...) -> None: ...
 
 class MotionJob(_message.Message):
-    __slots__ = ("max_run_s", "device", "min_memory_gb", "worker_labels", "name", "chest_mm", "pulse_mm", "vessel", "steps", "spacing_mm", "scene", "into", "dataset", "numbers")
+    __slots__ = ("max_run_s", "device", "min_memory_gb", "worker_labels", "name", "chest_mm", "pulse_mm", "vessel", "steps", "spacing_mm", "scene", "into", "dataset", "numbers", "field_leads", "field_axes", "field", "field_to_scene", "registration")
     class WorkerLabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -149,6 +149,11 @@ class MotionJob(_message.Message):
     INTO_FIELD_NUMBER: _ClassVar[int]
     DATASET_FIELD_NUMBER: _ClassVar[int]
     NUMBERS_FIELD_NUMBER: _ClassVar[int]
+    FIELD_LEADS_FIELD_NUMBER: _ClassVar[int]
+    FIELD_AXES_FIELD_NUMBER: _ClassVar[int]
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    FIELD_TO_SCENE_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     max_run_s: float
     device: str
     min_memory_gb: int
@@ -163,7 +168,12 @@ class MotionJob(_message.Message):
     into: str
     dataset: str
     numbers: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., name: _Optional[str] = ..., chest_mm: _Optional[float] = ..., pulse_mm: _Optional[float] = ..., vessel: _Optional[_Union[_scenes_pb2.Shape, _Mapping]] = ..., steps: _Optional[int] = ..., spacing_mm: _Optional[float] = ..., scene: _Optional[str] = ..., into: _Optional[str] = ..., dataset: _Optional[str] = ..., numbers: _Optional[_Iterable[float]] = ...) -> None: ...
+    field_leads: str
+    field_axes: str
+    field: FieldFile
+    field_to_scene: _containers.RepeatedScalarFieldContainer[float]
+    registration: str
+    def __init__(self, max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., name: _Optional[str] = ..., chest_mm: _Optional[float] = ..., pulse_mm: _Optional[float] = ..., vessel: _Optional[_Union[_scenes_pb2.Shape, _Mapping]] = ..., steps: _Optional[int] = ..., spacing_mm: _Optional[float] = ..., scene: _Optional[str] = ..., into: _Optional[str] = ..., dataset: _Optional[str] = ..., numbers: _Optional[_Iterable[float]] = ..., field_leads: _Optional[str] = ..., field_axes: _Optional[str] = ..., field: _Optional[_Union[FieldFile, _Mapping]] = ..., field_to_scene: _Optional[_Iterable[float]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class TrainJob(_message.Message):
     __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels", "start_scene")
@@ -287,6 +297,14 @@ class RenderJob(_message.Message):
     breathing: _scenes_pb2.Breathing
     indentation_mm: float
     def __init__(self, pose_count: _Optional[int] = ..., scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., max_run_s: _Optional[float] = ..., slice_thickness_mm: _Optional[float] = ..., shard_frames: _Optional[int] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[_rendering_pb2.Speckle, str]] = ..., phase: _Optional[_Iterable[float]] = ..., breathing: _Optional[_Union[_scenes_pb2.Breathing, _Mapping]] = ..., indentation_mm: _Optional[float] = ...) -> None: ...
+
+class FieldFile(_message.Message):
+    __slots__ = ("data", "format")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    data: str
+    format: str
+    def __init__(self, data: _Optional[str] = ..., format: _Optional[str] = ...) -> None: ...
 
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")

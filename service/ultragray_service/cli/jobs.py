@@ -56,6 +56,7 @@ _SUBMITS = {
     "live": ("ultragray jobs submit live liver --scene liver-live",),
     "motion": (
         "ultragray jobs submit motion liver --into liver-breathing --dataset liver --numbers $(paste -sd, belt.csv)",
+        "ultragray jobs submit motion liver --into inhaled --field inhale.nrrd --field-leads from-rest --wait",
         "ultragray jobs submit motion liver --into liver-breathing --chest-mm 8 --wait",
     ),
     "render": (

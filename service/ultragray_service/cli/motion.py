@@ -10,8 +10,8 @@ import numpy as np
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.registration import load_registration
 from ultragray.scene.info import read_header
-from ultragray.scene.label_maps import VECTOR_AXES, VECTOR_FIELD_SUFFIXES, read_vector_field
-from ultragray.scene.motion_settings import AUTO, FIELD_LEADS, MotionSettings
+from ultragray.scene.label_maps import VECTOR_FIELD_SUFFIXES, read_vector_field
+from ultragray.scene.motion_settings import AUTO, FIELD, MotionSettings
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     COMPRESSED_SUFFIX,
@@ -27,7 +27,7 @@ from ultragray_service.cli.terminal import (
     tell,
 )
 
-_SWEEP, _FIELD = "Learned from frames", "From a field of displacements"
+_SWEEP = "Learned from frames"
 
 
 @single(
@@ -47,28 +47,11 @@ def motion(
     ] = None,
     field: Annotated[
         Path | None,
-        option(f"A vector in mm for each voxel ({', '.join(VECTOR_FIELD_SUFFIXES)}), of a number of 1.", panel=_FIELD),
-    ] = None,
-    field_leads: Annotated[
-        str | None,
-        option(
-            "from-rest: from a point of the tissue at rest to where it goes. to-rest: from a point of moved tissue to "
-            "where it is at rest, as transforms of ITK and Slicer do that resample an image at rest.",
-            metavar="|".join(FIELD_LEADS),
-            panel=_FIELD,
-        ),
-    ] = None,
-    field_axes: Annotated[
-        str | None,
-        option(
-            "Axes of the vectors where a NIfTI file does not say; ITK, ANTs and Slicer write lps.",
-            metavar="|".join(VECTOR_AXES),
-            panel=_FIELD,
-        ),
+        option(f"A vector in mm for each voxel ({', '.join(VECTOR_FIELD_SUFFIXES)}), of a number of 1.", panel=FIELD),
     ] = None,
     registration: Annotated[
         Path | None,
-        option("File of `ultragray calibrate` (.json) that leads the field into the scene.", panel=_FIELD),
+        option("File of `ultragray calibrate` (.json) that leads the field into the scene.", panel=FIELD),
     ] = None,
     force: Force = False,
     json: Json = False,
@@ -79,10 +62,11 @@ def motion(
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
     read_header(scene)
     asked.check_source(sweep=sweep is not None, field=field is not None)
-    _check_pairs(sweep=sweep, surrogate=surrogate)
-    _check_pairs(field=field, field_leads=field_leads)
+    if (sweep is None) != (surrogate is None):
+        raise InvalidArgument("--sweep and --surrogate belong together", field="surrogate")
+    asked.check_field(is_given=field is not None)
     link = None if registration is None else load_registration(registration)
-    voxels = None if field is None else read_vector_field(field, field_axes)
+    voxels = None if field is None else read_vector_field(field, asked.field_axes)
 
     from ultragray import GaussianScene
     from ultragray.datasets.source import load_dataset
@@ -95,9 +79,9 @@ def motion(
         train = sources["sweep"] = load_dataset(sweep).train
         if surrogate != AUTO:
             sources |= {"numbers": read_numbers(surrogate, train), "surrogate": Path(surrogate).name}
-    if voxels is not None and field_leads is not None:
+    if voxels is not None and asked.field_leads is not None:
         to_scene = None if link is None else np.asarray(link.base_to_scene)
-        sources["field"] = field_of_voxels(voxels, loaded.info, field_leads, to_scene)
+        sources["field"] = field_of_voxels(voxels, loaded.info, asked.field_leads, to_scene)
     with counted("learning motion", asked.steps if sweep else 1) as count_done:
         added = add_motion(loaded, asked, **sources, report=lambda done, _: count_done(done))
     added.scene.save(output)
@@ -109,10 +93,3 @@ def motion(
     if (tube := added.tube) is not None:
         words += f"; the vessel's radius is {tube.radius_mm:.1f} mm"
     tell(words, {"output": str(output), **facts}, as_json=json)
-
-
-def _check_pairs(**given: Any) -> None:
-    """Raises InvalidArgument where one of two that belong together is missing."""
-    if len({one is None for one in given.values()}) > 1:
-        names = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise InvalidArgument(f"{names} belong together", field=next(iter(given)))

@@ -6,7 +6,7 @@
 
 A parameter whose type is a contract dataclass becomes an option for each of its fields, those of dataclasses within it
 included. Of a sampler it becomes `--sampler KIND` and the fields of all kinds; other families are written as JSON, and
-lists with commas; poses and tools are files. What is not given keeps its default.
+lists with commas; poses, tools and what is of a file are files. What is not given keeps its default.
 
     def train(settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)]) -> None:
 
@@ -32,6 +32,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.poses import load_poses
 from ultragray.rendering.tools import Tool, load_tools
 from ultragray.samplers import Sampler
+from ultragray.scene.shapes import OfFile
 
 FLAGS = {
     "settings": ("--set",),
@@ -154,7 +155,7 @@ def _may_vary(cls: Any, item: Field[Any]) -> bool:
 
 
 def _is_within(kind: Any) -> bool:
-    is_contract = isinstance(kind, type) and issubclass(kind, Contract)
+    is_contract = isinstance(kind, type) and issubclass(kind, Contract) and not issubclass(kind, OfFile)
     return is_contract and (not issubclass(kind, Family) or kind in _WITH_AN_OPTION_A_FIELD)
 
 
@@ -196,7 +197,8 @@ def _parameter(
         named = f" One of {', '.join(kind.named)}, or as" if kind.named else " As"
         meaning += f"{named} JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
-    parsed: Any = list[str] if is_table else Path if item.name in _FILES else kind if kind in _PARSED else str
+    is_file = item.name in _FILES or (isinstance(kind, type) and issubclass(kind, OfFile))
+    parsed: Any = list[str] if is_table else Path if is_file else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
     shown = not is_switch and _shown_default(item)
     option = typer.Option(
@@ -272,6 +274,8 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 def _read(value: Any, kind: Any, name: str) -> Any:
     if name in _FILES:
         return load_poses(value) if name == "poses" else load_tools(value)
+    if isinstance(kind, type) and issubclass(kind, OfFile):
+        return kind(**kind.of_file(value))
     if get_origin(kind) is tuple:
         return from_text(value, kind)
     if get_origin(kind) is dict:

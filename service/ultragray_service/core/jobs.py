@@ -15,16 +15,18 @@ from typing import Concatenate, ParamSpec, TypeAlias, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.contract import described, under
+from ultragray.contract import described, to_dict, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import Registration
 from ultragray.rendering.settings import Encoding
 from ultragray_service.access.audit import account
+from ultragray_service.access.limits import Slots
 from ultragray_service.access.owners import may_see
 from ultragray_service.access.principals import acting
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_service.core.scenes import MAX_PAGE_SIZE, scene_to_blame
+from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
@@ -41,6 +43,7 @@ from ultragray_workers.errors import (
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import JobFiles, Log
 from ultragray_workers.jobs.kinds import RenderJob, Specification
+from ultragray_workers.jobs.kinds.base import check_carried
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import Admit, JobsOverview, JobStore
@@ -266,6 +269,8 @@ async def _frame_s(rendering: Rendering, plan: Plan, poses: FloatArray) -> float
 
 
 COUNT_INTERVAL_S = 10.0
+FILE_CHECK_TIMEOUT_S = 600.0
+MAX_FILES_CHECKED = 8  # they wait for their turn in the helper process
 _BESIDE_SPECIFICATION = ("request_id", "priority")
 
 _log = logging.getLogger("ultragray.service")
@@ -294,8 +299,13 @@ class Jobs:
         datasets: DatasetStore,
         registration: Callable[[str, str], Registration],
         admit: Admit,
+        checks: HelperProcesses,
     ) -> None:
-        """`registration`: finds that of a name, for a scene; it blocks, as `admit` does, which each new job passes."""
+        """`registration`: finds that of a name, for a scene; it blocks, as `admit` does, which each new job passes.
+
+        `checks`: of files that come with jobs.
+        """
+        self._checks, self._checked = checks, Slots(MAX_FILES_CHECKED, "files of jobs")
         self._settings, self._scenes, self._datasets = settings, scenes, datasets
         self._registration = registration
         self._opened: JobStore | None = None
@@ -348,9 +358,18 @@ class Jobs:
         """The job, and whether it is new. `field` is where the caller wrote the specification.
 
         Raises InvalidArgument, JobConflict, JobQueueFull, DatasetNotFound, DatasetInvalid, SceneNotFound,
-        SceneFileInvalid, SceneExists, RegistrationNotFound, LimitReached.
+        SceneFileInvalid, SceneExists, RegistrationNotFound, LimitReached, and QueueFull for a file that comes with it.
         """
         with _specification_to_blame(field):
+            if specification.carried is not None:
+                with self._checked.one():
+                    await self._checks.run(
+                        check_carried,
+                        {"document": to_dict(specification)},
+                        what="checking the file of the job",
+                        timeout_s=FILE_CHECK_TIMEOUT_S,
+                        killed=InvalidArgument,
+                    )
             job, is_new = await self.do(
                 JobStore.submit,
                 specification,

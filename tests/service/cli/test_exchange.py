@@ -77,7 +77,7 @@ def test_a_field_of_displacements_becomes_a_mode_beside_a_vessel_that_pulsates(m
     affine[:3, 3] = -60.0
     nibabel.save(nibabel.Nifti1Image(vectors, affine), field)
     asked = ("motion", make_file(), "-o", inhaling, "--field", field)
-    assert "--field and --field-leads belong together" in refused(*asked)
+    assert "field and field_leads belong together" in refused(*asked)
     assert "in which axes its vectors are" in refused(*asked, "--field-leads", "from-rest")
     made = run(*asked, "--field-leads", "from-rest", "--field-axes", "ras", "--json")
     facts = json.loads(made.stdout)

@@ -49,6 +49,11 @@ export function isSimple({ type, enum: choices }: Described): boolean {
   return choices !== undefined || ["number", "integer", "boolean", "string"].includes(type ?? "");
 }
 
+/** Whether a value is a file, which travels within a document. */
+export function isFile({ properties = {} }: Described): boolean {
+  return "data" in properties && "format" in properties;
+}
+
 /** Whether a value is a place, a direction or an extent: three numbers. */
 export function isVector({ type, items, minItems, maxItems }: Described): boolean {
   return type === "array" && items?.type === "number" && minItems === 3 && maxItems === 3;

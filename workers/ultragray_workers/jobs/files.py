@@ -106,6 +106,16 @@ class JobFiles:
         """Keeps a scene, as it is now, for a job that is submitted. Raises FileNotFoundError where it is gone."""
         self.storage.upload(path, scene_key(job_id, scene))
 
+    def keep_carried(self, name: str, content: bytes, job_id: str) -> None:
+        """Keeps the file that comes with a job that is submitted."""
+        self.storage.write(carried_key(job_id, name), content)
+
+    def keep_carried_again(self, name: str, before: str, job_id: str) -> None:
+        """Keeps the file of a job for the one in its place, too."""
+        with self._fetched(carried_key(before, name)) as path:
+            if path is not None:
+                self.storage.upload(path, carried_key(job_id, name))
+
     def remove(self, job_id: str) -> None:
         self.storage.delete_all(f"{FOLDER}/{job_id}")
 
@@ -142,6 +152,10 @@ def batch_prefix(job_id: str) -> str:
 
 def scene_key(job_id: str, scene: str) -> str:
     return f"{FOLDER}/{job_id}/{scene}{SUFFIX}"
+
+
+def carried_key(job_id: str, name: str) -> str:
+    return f"{FOLDER}/{job_id}/{name}"
 
 
 def _read_pieces(storage: Storage, pieces: Sequence[Piece], start: int, length: int) -> bytes:

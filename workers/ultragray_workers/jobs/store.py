@@ -48,7 +48,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import AUTO, CPU, CUDA, Demand, waits_for
 from ultragray_workers.jobs.files import Artifact, JobFiles
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.kinds.base import Surroundings, from_dict, in_short, to_dict, value_in
+from ultragray_workers.jobs.kinds.base import Surroundings, carried_name, from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
@@ -195,6 +195,7 @@ class JobStore:
             most_running = admit(self)
             placed = self._placed(specification)
             used = self._provide(placed, job_id, retry_of)
+            self._keep_carried(placed, carried_name(summary), job_id, retry_of)
             is_private = whose.private | self._are_private(used, owner, by)
             made = value_in(summary, "makes_scene")
             trace: dict[str, str] = {}
@@ -295,6 +296,16 @@ class JobStore:
                     self._scenes.path(name)  # raises SceneNotFound where the scene has just gone
                     raise
         return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
+
+    def _keep_carried(self, specification: Specification, name: str | None, job_id: str, before: str | None) -> None:
+        """Keeps the file that comes with the job, or came with the job before, for the job. Raises InvalidArgument."""
+        if name is None:
+            return
+        with storage_full("the file of the job"):
+            if before is None:
+                self.files.keep_carried(name, specification.carried_content(), job_id)
+            else:
+                self.files.keep_carried_again(name, before, job_id)
 
     def _require_dataset(self, specification: Specification, dataset: str) -> None:
         """Raises DatasetNotFound, DatasetInvalid."""

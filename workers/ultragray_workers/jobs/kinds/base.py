@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -18,6 +20,7 @@ from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.samplers import MAX_POSES
 from ultragray.scene.info import SceneHeader
+from ultragray.scene.shapes import OfFile
 from ultragray_workers.jobs.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
@@ -79,6 +82,7 @@ class Specification(Family):
     takes_recordings: ClassVar[bool] = False  # also a recording, which is no dataset yet
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
+    carries: ClassVar[str | None] = None  # field: a file that comes with the job; it is kept for it, beside its row
     has_checkpoints: ClassVar[bool] = False  # interrupted, it goes on from where it was; others begin anew
     makes_scene: ClassVar[str | None] = None  # field: the scene among the artifacts is served when the job succeeds
     serves_versions: ClassVar[bool] = False  # it serves that scene while it runs, too, and keeps it whatever ends it
@@ -94,6 +98,20 @@ class Specification(Family):
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""
+
+    @property
+    def carried(self) -> OfFile | None:
+        """The file that comes with the job."""
+        return None if self.carries is None else getattr(self, self.carries)
+
+    def carried_content(self) -> bytes:
+        """Raises InvalidArgument."""
+        assert self.carried is not None
+        with contract.under(str(self.carries)):
+            return self.carried.content()
+
+    def check_carried(self, path: Path) -> None:
+        """Raises what the job would fail with for that file."""
 
     def registered(self, registration: Registration) -> Self:
         """The job with its poses brought into its scene, which names no registration any more."""
@@ -122,7 +140,10 @@ class Specification(Family):
 
 
 def to_dict(specification: Specification) -> dict[str, Any]:
-    """The specification in JSON; `kind` comes first. Poses are base64 of float64, row by row, the low byte first."""
+    """The specification in JSON; `kind` comes first. Poses are base64 of float64, row by row, the low byte first.
+
+    Of a file that it carries it tells the hash alone.
+    """
     document, poses = _without_poses(specification)
     if poses is not None:
         document[_POSES] = base64.b64encode(poses.astype("<f8").tobytes()).decode("ascii")
@@ -152,6 +173,22 @@ def value_in(document: Mapping[str, Any], role: str) -> str | None:
     return None if field is None else document.get(field)
 
 
+def carried_name(document: Mapping[str, Any]) -> str | None:
+    """What the file that a job's JSON tells of is called where it is kept for the job."""
+    field = Specification.member(document["kind"]).carries
+    file = None if field is None else document.get(field)
+    return None if file is None else f"{field}.{file['format']}"
+
+
+def check_carried(*, document: dict[str, Any]) -> None:
+    """The work of a helper process: raises what the file that comes with a job is refused for."""
+    specification = from_dict(document)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, str(carried_name(document)))
+        path.write_bytes(specification.carried_content())
+        specification.check_carried(path)
+
+
 def has_checkpoints(document: Mapping[str, Any]) -> bool:
     """Whether a job's JSON asks for work that, interrupted, goes on from where it was."""
     return Specification.member(document["kind"]).has_checkpoints or is_in_shards(document)
@@ -167,6 +204,8 @@ def _without_poses(specification: Specification) -> tuple[dict[str, Any], FloatA
         item.name for item, _ in contract.annotated_fields(type(specification)) if item.name not in ("kind", _POSES)
     ]
     values = {name: contract.to_dict(getattr(specification, name), with_none=False) for name in names}
+    if (file := specification.carried) is not None:
+        values[str(specification.carries)] = file.recorded()
     poses = getattr(specification, _POSES, None)
     return {"kind": specification.kind, **values}, None if poses is None else np.asarray(poses)
 

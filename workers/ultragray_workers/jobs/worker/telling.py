@@ -29,10 +29,11 @@ from ultragray_workers.jobs.files import (
     FOLDER,
     JOURNAL_NAME,
     batch_prefix,
+    carried_key,
     scene_key,
 )
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.kinds.base import is_in_shards, value_in
+from ultragray_workers.jobs.kinds.base import carried_name, is_in_shards, value_in
 from ultragray_workers.jobs.progress import Files, Outcome, Piece, StoredFile
 from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.worker.process import end_process_of_another_worker
@@ -161,6 +162,9 @@ class Telling:
         if (scene := value_in(row.summary, "needs_scene")) is not None:
             with contextlib.suppress(NotThere):  # then the process says so
                 self._storage.download(scene_key(row.batch or row.id, scene), folder.path / f"{scene}{SUFFIX}")
+        if (name := carried_name(row.summary)) is not None:
+            with contextlib.suppress(NotThere):
+                self._storage.download(carried_key(row.id, name), folder.path / name)
         if row.progress is not None:
             folder.write_progress(row.progress)
         if row.published and row.outcome is not None:
