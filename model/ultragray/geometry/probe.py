@@ -100,6 +100,10 @@ class ScanLines(ABC):
     def breadth_mm(self, depth_mm: float) -> float:
         """Length of a row of the image at a depth."""
 
+    @abstractmethod
+    def moved(self, across: float) -> FloatArray:  # [4, 4] mm
+        """The motion, in the frame of the probe, that puts every line where one so far across from it was."""
+
     @property
     def are_upright(self) -> bool:
         """Whether all lines run along z: a frame is then a picture that is true to scale."""
@@ -145,6 +149,11 @@ class ParallelLines(ScanLines):
     def breadth_mm(self, depth_mm: float) -> float:
         return self.span
 
+    def moved(self, across: float) -> FloatArray:  # [4, 4] mm
+        motion = np.eye(4)
+        motion[0, 3] = across
+        return motion
+
     @property
     def are_upright(self) -> bool:
         return self.steering_deg == 0.0
@@ -162,6 +171,12 @@ class _Angular(ScanLines):
 
     def breadth_mm(self, depth_mm: float) -> float:
         return depth_mm * math.radians(self.span)
+
+    def moved(self, across: float) -> FloatArray:  # [4, 4] mm
+        motion, angle = np.eye(4), math.radians(across)
+        motion[0, 0] = motion[2, 2] = math.cos(angle)
+        motion[0, 2], motion[2, 0] = math.sin(angle), -math.sin(angle)
+        return motion
 
 
 @dataclass(frozen=True)

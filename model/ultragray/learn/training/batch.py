@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.probe import FloatArray, ScanLines
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.between import ViewsBetween
 from ultragray.learn.training.config import TrainingConfig
@@ -63,6 +63,21 @@ class Batch:
         weights = None if self.weights is None else avg_pool2d(self.weights, 2)
         halved = replace(self, truth=avg_pool2d(self.truth, 2), weights=weights, neighbours=neighbours)
         return halved, shadowed[used.to(shadowed.device), ::2, ::2].contiguous()
+
+    def of_lines(self, lines: ScanLines, first: int, every: int, shadowed: Tensor) -> tuple[Batch, Tensor]:
+        """With every so-manyth of the scan lines, from the first one told, which their number must be a multiple of:
+        all lines of a probe that is moved. The shadows of its neighbours likewise, [F, H, W] -> [F', H, W / every].
+        """
+        used, neighbours = torch.unique(self.neighbours, return_inverse=True)
+        across = lines.span * (first + 0.5 - every / 2) / self.truth.shape[2]
+        some = replace(
+            self,
+            poses=self.poses @ lines.moved(across),
+            truth=self.truth[..., first::every].contiguous(),
+            weights=None if self.weights is None else self.weights[..., first::every].contiguous(),
+            neighbours=neighbours,
+        )
+        return some, shadowed[used.to(shadowed.device)][..., first::every].contiguous()
 
     def loss(self, frames: Frames, shadowed: Tensor | None, config: TrainingConfig) -> Tensor:
         """How far frames are from what they should show, and the price of absorption but in `shadowed` pixels of the

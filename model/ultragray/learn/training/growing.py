@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ from ultragray.learn.training.between import ViewsBetween, neighbours_of
 from ultragray.learn.training.checkpointing import CheckpointHeader, read_checkpoint, write_checkpoint
 from ultragray.learn.training.confidence import Examples, fit_weights
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.learn.training.geometry import Geometry, Shadows
+from ultragray.learn.training.geometry import SAME_DETAIL, Geometry, Shadows, shared_detail
 from ultragray.learn.training.initial import Start, initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0
 from ultragray.learn.training.losses import SSIM_WINDOW
@@ -61,7 +62,8 @@ LEAST_FRAMES = 4  # to train from, before anything is shown
 SURVEY_GROWTH = 1.5
 WINDOW_FRAMES = 6  # about each new one, among which it finds its neighbours
 STILL = 0.25  # of the usual spacing: a frame nearer to one that is there already shows no new place
-MOST_AT_ONCE = 16_000  # Gaussians of a sweep that is over and learned in seconds
+MOST_AT_ONCE, MOST_OF_DETAIL = 16_000, 38_000  # Gaussians of a sweep that is over and learned in seconds
+DETAIL_BATCH, DETAIL_LINES = 4, 4  # views of a step where frames share their detail, and of them every fourth scan line
 SMALL_PIXELS = 8_000  # of a frame to train from, at least
 SIZED_BY = 16  # frames, which tell what becomes smaller
 FOURS, FAR_LESS = ((2, 2), (1, 4), (4, 1)), 0.5  # rows and columns; of the variance that a square hides
@@ -104,6 +106,7 @@ class GrowingTrainer:
         # still to come again.
         self.judged: dict[int, float] = {}
         self._whole: PoseRefinement | None = None  # the poses of a sweep that came at once
+        self._every = 1  # so-manyth scan line of a frame is in a step
         self._caution = 1.0  # factor on all rates: less after a version that was worse
 
     @property
@@ -131,11 +134,16 @@ class GrowingTrainer:
         train, config = self._train, self._config
         is_recent = self._whole is None and self.step % 2 == 0 and self.step - int(self._born.max()) < RECENT_STEPS
         first = max(0, len(train) - RECENT_FRAMES) if is_recent else 0
-        own_count = min(config.batch_size - config.batch_size // 2, len(train) - first)
+        assert config.views_between is not None
+        between_count = round(config.views_between * config.batch_size)
+        own_count = min(config.batch_size - between_count, len(train) - first)
         own = first + torch.randperm(len(train) - first, generator=self._generator)[:own_count]
         between = self._between[is_recent]
-        batch = Batch.of(train, self._images, own, between, config.batch_size // 2, config, self._generator)
+        batch = Batch.of(train, self._images, own, between, between_count, config, self._generator)
         shadowed, age = self._shadowed, self.step - int(self._born.max() if is_recent else self._born.median())
+        if self._every > 1:
+            first = int(torch.randint(self._every, (1,), generator=self._generator))
+            batch, shadowed = batch.of_lines(self._probe.lines, first, self._every, shadowed)
         is_quick = self.gaussian_count <= COARSE_GAUSSIANS * train.height * train.width
         for steps in COARSE_STEPS:
             if age < steps and is_quick and batch.can_be_halved:
@@ -216,11 +224,17 @@ class GrowingTrainer:
         """Another trainer of the same sweep, which is over: of all frames at once, at the poses of the path that they
         agree with.
 
-        It has few Gaussians, so that it takes many steps in seconds, and no checkpoints.
+        It has few Gaussians, so that it takes many steps in seconds, and no checkpoints. Where frames share their
+        detail, small ones would hide it: then steps are on some of the scan lines, others each time.
         """
         whole = PoseRefinement.of(dataset, "path")
         other = GrowingTrainer(self.name, self._probe, seed=self._given.seed, device=self._asked, backend=self._backend)
         other._whole, other.judged = whole, self.judged
+        train = whole.dataset.train
+        lines, left = divmod(train.width, DETAIL_LINES)
+        if not left and lines >= SSIM_WINDOW and shared_detail(train) >= SAME_DETAIL:
+            other._size, other._every = (train.height, train.width), DETAIL_LINES
+            other._given = replace(other._given, batch_size=DETAIL_BATCH, views_between=1 / DETAIL_BATCH)
         other.add(*in_recorded_order(whole.dataset))
         return other
 
@@ -314,12 +328,13 @@ class GrowingTrainer:
             usual = max(pixels // PIXELS_PER_GAUSSIAN, min(pixels // LEAST_PIXELS, USUAL_GAUSSIANS))
             count = int(moved.sum()) * usual
             if self._whole is not None:
-                count = min(count, MOST_AT_ONCE)
+                count = min(count, MOST_AT_ONCE if self._every == 1 else MOST_OF_DETAIL)
             if count and len(beside.pairs):
                 config = replace(self._config, initial_gaussians=count, max_gaussians=count)
                 part = Dataset(self.name, train.select(window), train.select([]))
                 shadows = self._shadows.seen_in(part.train)
-                self._append(initial_parameters(part, beside, shadows, self._geometry, config, self._generator))
+                start = partial(initial_parameters, part, beside, shadows, self._geometry, config, self._generator)
+                self._append(start(by_detail=self._every > 1))
             self._grown = len(train)
         self._look_between(train)
 

@@ -10,15 +10,17 @@ nothing is left the smoothed tissue itself. A floor under it makes what lies abo
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ultragray.geometry.pose import quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.sweep import Dataset, IntArray
+from ultragray.learn.sweep import Dataset, IntArray, Sweep
 from ultragray.learn.training.between import Neighbours, draw_places
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import SPENT, Geometry, Shadows
@@ -32,6 +34,9 @@ RELEASED_INTENSITY = 0.6  # of the released start: sh0 = (0.1 − 0.5) / 0.28209
 RELEASED_CUBE = 0.8  # half-side of the released start, × scene scale
 BEYOND_ELEVATION = 0.5  # standard deviation along elevation beyond an end, × the distance from it
 UNPRUNED = 0.9  # of the standard deviation above which a refinement prunes
+DETAIL_MM = 1.0  # standard deviation of the Gaussian beyond which structure is no detail, and over which it is averaged
+DENSITY, PLAIN = 2 / 3, 0.1  # the former has the least error of means over squares; of the mean, where nothing is
+SIZES, WIDER = (0.3, 3.0), 2.0  # of the usual one; times as wide as deep
 MOST_LIT = 1.5  # × the smoothed brightness: what noise in a shadow may be brightened to
 
 
@@ -49,6 +54,8 @@ def initial_parameters(
     geometry: Geometry,
     config: TrainingConfig,
     generator: torch.Generator,
+    *,
+    by_detail: bool = False,
 ) -> Start:
     """The start, float32, drawn with `generator` alone; `config` leaves nothing open.
 
@@ -56,7 +63,8 @@ def initial_parameters(
     planes between neighbouring frames and beyond the ends (`between.draw_places`) and puts a Gaussian on each, turned
     like a frame there and as thick as a slice, with the frames' brightness there as its intensity. Where the frames
     show a shadow (`shadows`) it gets the intensity that the whole beam would show, and a floor of nearly that, so that
-    what is above it must absorb.
+    what is above it must absorb. `by_detail`: more and smaller ones where the frames show detail, wider than deep, as
+    echoes are: few Gaussians then show more from the first step on.
     """
     count = config.initial_gaussians
     assert count is not None
@@ -72,7 +80,7 @@ def initial_parameters(
         means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
         brightness = torch.full((count,), RELEASED_INTENSITY)
     elif config.start == "informed":
-        pixels = _on_planes(dataset, neighbours, count, shadows, generator)
+        pixels = _on_planes(dataset, neighbours, count, shadows, generator, by_detail)
         means = torch.from_numpy((pixels.points_mm - geometry.centre_mm) / 10.0).float()
         brightness = torch.from_numpy(pixels.brightness).float()
         floor = config.intensity_floor * torch.from_numpy(pixels.unshadowed).float()
@@ -81,6 +89,7 @@ def initial_parameters(
         most_mm = max(10.0 * UNPRUNED * config.prune_above * geometry.scene_scale_cm, config.initial_elevation_mm)
         beyond_mm = torch.from_numpy(BEYOND_ELEVATION * np.abs(pixels.beyond_mm)).float()
         scales_mm[:, 1] = beyond_mm.clamp(config.initial_elevation_mm, most_mm)
+        scales_mm[:, ::2] *= torch.from_numpy(pixels.sizes).float()
     else:
         raise AssertionError(config.start)
     logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
@@ -104,14 +113,23 @@ class _Pixels(NamedTuple):
     beyond_mm: FloatArray  # [N] distance of the plane from an end of the sweep, 0 within it
     brightness: FloatArray  # [N] in [0, 1], with the whole beam
     unshadowed: FloatArray  # [N] the part of it that smooth tissue has where it is in a shadow, else 0
+    sizes: FloatArray  # [N, 2] laterally and axially, of the usual one
 
 
 def _on_planes(
-    dataset: Dataset, neighbours: Neighbours, count: int, shadows: Shadows | None, generator: torch.Generator
+    dataset: Dataset,
+    neighbours: Neighbours,
+    count: int,
+    shadows: Shadows | None,
+    generator: torch.Generator,
+    by_detail: bool,
 ) -> _Pixels:
     sweep, probe = dataset.train, dataset.probe
     places = draw_places(neighbours, count, generator)
     across, deep = torch.rand((2, count), generator=generator, dtype=torch.float64).numpy()  # share of the image
+    sizes = np.ones((count, 2))
+    if by_detail:
+        deep, across, sizes = _where_detail_is(sweep, places.nearer, deep, across, generator)
     points_mm = probe.points_mm(deep, across)
     poses = places.poses(sweep)
     tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
@@ -137,4 +155,27 @@ def _on_planes(
         beyond_mm=places.beyond_mm,
         brightness=brightness[nearer],
         unshadowed=unshadowed[nearer],
+        sizes=sizes,
     )
+
+
+def _where_detail_is(
+    sweep: Sweep, frames: IntArray, deep: FloatArray, across: FloatArray, generator: torch.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # [N] each -> [N], [N], [N, 2]
+    """Places in frames as dense as their detail to the power DENSITY, given ones within a pixel, and sizes there."""
+    drawn = torch.rand(len(frames), generator=generator, dtype=torch.float64).numpy()
+    deep, across, sizes = deep.copy(), across.copy(), np.empty((len(frames), 2))
+    axial, lateral = (max(0.5, DETAIL_MM / pixel_mm) for pixel_mm in sweep.pixel_mm)
+    blurred = partial(cv2.GaussianBlur, ksize=(0, 0), sigmaX=lateral, sigmaY=axial, borderType=cv2.BORDER_REPLICATE)
+    for frame in np.unique(frames):
+        (own,) = np.nonzero(frames == frame)
+        image = sweep.images[frame].astype(np.float32)
+        density = np.float64(blurred(np.abs(image - blurred(image)))) ** DENSITY + 1e-9
+        density = (density / density.mean() + PLAIN) / (1.0 + PLAIN)
+        summed = np.cumsum(density)
+        chosen = np.searchsorted(summed, drawn[own] * summed[-1]).clip(max=density.size - 1)
+        rows, columns = np.divmod(chosen, sweep.width)
+        deep[own], across[own] = (rows + deep[own]) / sweep.height, (columns + across[own]) / sweep.width
+        size = np.clip(density.ravel()[chosen] ** -0.5, *SIZES)
+        sizes[own] = size[:, None] * (WIDER**0.5, WIDER**-0.5)
+    return deep, across, sizes

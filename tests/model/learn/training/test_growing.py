@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from ultragray.errors import DatasetInvalid
+from ultragray.geometry.probe import ConvexProbe, LinearProbe, RadialProbe
 from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.sweep import Dataset, Sweep, split_sequence
 from ultragray.learn.training import growing
+from ultragray.learn.training.batch import Batch
 from ultragray.learn.training.growing import GrowingTrainer, Judgement
 from ultragray.learn.training.optimizer import Optimizer
 from ultragray.learn.training.poses import PoseRefinement
@@ -41,27 +43,49 @@ def all_psnr_db(trainer, monkeypatch):
     return trainer.judge().mean_psnr_db
 
 
-def test_a_sweep_that_is_over_is_learned_anew_from_small_frames(sweep, monkeypatch):
+@pytest.mark.parametrize(("same", "size"), [(2.0, (SIDE // 2, SIDE // 2)), (-2.0, (SIDE, SIDE // 4))])
+def test_a_sweep_that_is_over_is_learned_anew_from_small_frames_or_some_of_the_lines(sweep, same, size, monkeypatch):
     monkeypatch.setattr(growing, "SMALL_PIXELS", (SIDE // 2) ** 2)
-    monkeypatch.setattr(growing, "MOST_AT_ONCE", 1000)
+    monkeypatch.setattr(growing, "SAME_DETAIL", same)
+    for most in ("MOST_AT_ONCE", "MOST_OF_DETAIL"):
+        monkeypatch.setattr(growing, most, 1000)
     sizes, true_render = [], growing.render
     monkeypatch.setattr(
-        growing, "render", lambda *a, **k: sizes.append(k["height"] * k["width"]) or true_render(*a, **k)
+        growing, "render", lambda *a, **k: sizes.append((k["height"], k["width"])) or true_render(*a, **k)
     )
     dataset = Dataset("phantom", *split_sequence(sweep, COUNT, None, None))
     trainer = grown(sweep, steps=0)
     trainer.accept(trainer.judge())
     again = trainer.anew(dataset)
     at_first = all_psnr_db(again, monkeypatch)
-    for step in range(40):
-        again.take_step(0.1 ** (step / 40))
+    for step in range(80):
+        again.take_step(0.1 ** (step / 80))
     judgement = again.judge()
-    assert set(sizes) == {growing.SMALL_PIXELS}
+    assert set(sizes) == {size}
     assert judgement.mean_psnr_db > at_first + 2.0
     assert not again.is_worse(judgement)  # than what was shown of the frames as they came
     scene = again.scene(judgement)
     assert (scene.info.image_height, scene.gaussian_count) == (SIDE, 1000)
     assert len(scene.training_poses) == len(dataset.train)
+
+
+@pytest.mark.parametrize(
+    "probe", [LinearProbe(40.0, 2.0, 42.0), ConvexProbe(60.0, 20.0, 60.0), RadialProbe(2.0, 30.0)], ids=str
+)
+def test_some_of_the_lines_are_those_of_a_probe_that_is_moved(sweep, probe):
+    random = torch.Generator().manual_seed(0)
+    truth, weights = torch.rand((2, 4, 16, 32), generator=random)
+    shadowed = torch.rand((9, 16, 32), generator=random) > 0.5
+    neighbours = torch.tensor([[2, 2], [5, 5], [5, 2], [8, 2]])
+    whole = Batch(sweep.poses[:4], neighbours[:, 0], neighbours, truth, weights[2:])
+    places = (np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, (np.arange(8) + 0.5) / 8
+    points = probe.points_mm(*np.meshgrid(places[0], places[1], indexing="ij"))[:, 1::4] @ whole.poses[0, :3, :3].T
+    some, some_shadowed = whole.of_lines(probe.lines, 1, 4, shadowed)
+    moved = probe.points_mm(*np.meshgrid(places[0], places[2], indexing="ij")) @ some.poses[0, :3, :3].T
+    assert moved + some.poses[0, :3, 3] == pytest.approx(points + whole.poses[0, :3, 3])
+    assert torch.equal(some.truth, truth[..., 1::4])
+    assert torch.equal(some.weights, weights[2:, :, 1::4])
+    assert torch.equal(some_shadowed[some.neighbours], shadowed[neighbours][..., 1::4])
 
 
 def test_poses_of_a_sweep_that_is_over_are_those_that_its_whole_frames_agree_with(sweep, monkeypatch):

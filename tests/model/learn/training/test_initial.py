@@ -22,18 +22,18 @@ from ultragray.learn.training.geometry import (
     shared_detail,
     shift_out_of_plane,
 )
-from ultragray.learn.training.initial import initial_parameters
+from ultragray.learn.training.initial import DETAIL_MM, WIDER, initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0, sh0_of_intensity
 from ultragray.learn.training.optimizer import rotate
 from ultragray.rendering.backends import reference
 from ultragray.scene.info import expected_shapes
 
 
-def whole_start_of(dataset, config):
+def whole_start_of(dataset, config, **how):
     geometry, neighbours = Geometry.of(dataset), neighbours_of(dataset.train)
     shadows = Shadows(dataset.train) if config.transmittance else None
     generator = torch.Generator().manual_seed(3)
-    return initial_parameters(dataset, neighbours, shadows, geometry, config.resolved(geometry), generator)
+    return initial_parameters(dataset, neighbours, shadows, geometry, config.resolved(geometry), generator, **how)
 
 
 def start_of(dataset, config):
@@ -92,6 +92,22 @@ def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(
     elevation = rotate(parameters["quats"], torch.tensor([[0.0, 1.0, 0.0]]).expand(len(parameters["quats"]), 3))
     assert torch.allclose(elevation, torch.tensor(turn[:, 1]).float(), atol=1e-6)
     assert torch.allclose(parameters["scales"].exp(), torch.tensor([0.1, 0.4, 0.1]))
+
+
+def test_a_start_by_detail_has_more_and_smaller_gaussians_where_the_frames_show_some(tiny_dataset, tiny_config):
+    dataset = tiny_dataset()
+    images = np.full_like(dataset.train.images, 100)
+    middle = images.shape[2] // 2
+    images[:, ::8, middle:] = 200
+    dataset = replace(dataset, train=replace(dataset.train, images=images))
+    config = tiny_config(max_gaussians=2_000, initial_scale_mm=1.0, transmittance=False)
+    parameters = whole_start_of(dataset, config, by_detail=True).parameters
+    x_mm = parameters["means"][:, 0].numpy() * 10.0 + Geometry.of(dataset).centre_mm[0]
+    is_plain = x_mm < dataset.train.poses[0, 0, 3] - 2.0 * DETAIL_MM
+    lateral, _, axial = parameters["scales"].exp().unbind(1)
+    assert 0 < is_plain.sum() < 0.2 * len(x_mm)
+    assert lateral[is_plain].min() > lateral[~is_plain].median()
+    assert torch.allclose(lateral, WIDER * axial)
 
 
 def test_gaussians_beyond_an_end_are_the_thicker_the_farther_they_lie(tiny_dataset, tiny_config):
