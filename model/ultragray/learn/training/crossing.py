@@ -45,7 +45,7 @@ LEVELS = ((4.0, 30.0), (2.0, 10.0), (0.7, 5.0))  # pixels: deviations of a blur,
 STEPS = 8  # of each at most
 SMALL_MM = 0.02  # after a step that changes no coefficient by more, a level is over
 LEAST_GAIN = 0.01  # of the correlation: where poses are exact, it gains half of that at most
-OUTLIER = 2.0  # robust standard deviations: beyond, a residual counts in proportion, no longer by its square
+OUTLIER = 2.0  # standard deviations: beyond, a residual counts in proportion, no longer by its square
 _NUMBERS = 6  # of a twist
 _ROWS = 4096  # of the least squares at a time
 
@@ -73,8 +73,9 @@ def crossing_agreement(
     """
     if len(ranges) < 2:
         return None
-    chosen = places[spread_places(len(sweep), FRAMES)]
-    looked_at = replace(sweep.select(spread_places(len(sweep), FRAMES)), poses=path[chosen])
+    some = spread_places(len(sweep), FRAMES)
+    chosen = places[some]
+    looked_at = replace(sweep.select(some), poses=path[chosen])
     passes = np.repeat(np.arange(len(ranges)), [len(frames) for frames in ranges])[chosen]
     fitted, judged = (_Crossing(looked_at, passes, seed) for seed in range(2))
     all_splines = _splines(ranges, max(KNOT_FRAMES * len(path) / len(sweep), len(path) / MOST_KNOTS))
@@ -90,8 +91,8 @@ def crossing_agreement(
             coefficients = fitted.improved(details, max(1.0, level[0]), splines, earlier)
             if np.abs(coefficients - earlier).max() < SMALL_MM:
                 break
-    before, after = (judged.correlation(details, splines @ some) for some in (still, coefficients))
-    if after < before + LEAST_GAIN:
+    before, after = (judged.correlation(details, splines @ one) for one in (still, coefficients))
+    if not after >= before + LEAST_GAIN:
         return None
     twists = all_splines @ coefficients
     shift_mm = float(np.sqrt(np.square(twists[:, 3:]).sum(axis=1).mean()))
@@ -156,10 +157,12 @@ class _Crossing:
         """The coefficients after a step of Gauss–Newton; slopes are differences over `step_pixels` to either side."""
         poses = self._sweep.poses @ self.motions(splines @ coefficients)
         seen = self.seen(details, poses)
+        if len(seen.shown) < LEAST_POINTS * POINTS:
+            return coefficients  # the passes have been moved apart
         slopes, known = self._slopes(details, poses, seen, step_pixels * min(self._sweep.pixel_mm))
         scale, offset = np.polyfit(seen.predicted, seen.shown, 1)
         residuals = seen.shown - scale * seen.predicted - offset
-        deviation = 1.4826 * float(np.median(np.abs(residuals)))
+        deviation = max(float(residuals.std()), 1e-6)
         weights = known / np.maximum(1.0, np.abs(residuals) / (OUTLIER * deviation)) / deviation**2
         size = coefficients.size
         normal, right = np.eye(size) / USUAL_MM**2, -coefficients.reshape(-1) / USUAL_MM**2
