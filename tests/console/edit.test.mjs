@@ -84,6 +84,8 @@ describe("edits of a scene", () => {
     const page = await openEdit();
     await button(page, "+ Thin").click();
     await button(page, "+ Relabel").click();
+    await button(page, "Paint").click();
+    await button(page, "Another shape").click();
     await page.getByLabel("Centre X, mm").fill("5000");
     await page.keyboard.press("Tab");
     await button(page, "1 Thin").click();
@@ -96,6 +98,54 @@ describe("edits of a scene", () => {
     await button(page, "Save as a new scene").click();
     await panelOf(page).locator("p.mistake").getByText("there is already a scene 'demo'").waitFor();
     assert.equal(await panelOf(page).getByLabel("New scene").getAttribute("aria-invalid"), "true");
+  });
+
+  it("paint a label across the image: each stroke is one step, and all of them are one edit", async () => {
+    const page = await openEdit();
+    await button(page, "+ Relabel").click();
+    await panelOf(page).getByRole("textbox", { name: "Label" }).fill("lesion");
+    await panelOf(page).getByRole("spinbutton", { name: "Brush radius" }).fill("3");
+    await page.keyboard.press("Tab");
+    const painted = async () => Number.parseInt(await page.getByTestId("painted").textContent());
+    assert.equal(await painted(), 0);
+    const ends = { first: [[0.3, 0.4], [0.6, 0.5]], second: [[0.4, 0.7], [0.6, 0.7]] };
+    const beginStroke = async ([from, to]) => {
+      await page.mouse.move(...(await screenAt(page, from)));
+      await page.mouse.down();
+      await page.mouse.move(...(await screenAt(page, to)), { steps: 6 });
+    };
+    await beginStroke(ends.first);
+    const outline = await page.getByTestId("outline").boundingBox();
+    const [[left, top], [right, bottom]] = await Promise.all(ends.first.map((end) => screenAt(page, end)));
+    assert.ok(outline.x < left && outline.y < top && outline.x + outline.width > right && outline.y + outline.height > bottom, "it does not show");
+    await picture(page, "edit-painting");
+    await new Promise((resolve) => setTimeout(resolve, 700)); // longer than what changes of one step may be apart
+    await page.mouse.move(...(await screenAt(page, [0.62, 0.5])), { steps: 3 });
+    await page.mouse.up();
+    const one = await painted();
+    await beginStroke(ends.second);
+    await page.mouse.up();
+    const both = await painted();
+    assert.ok(one > 5 && both > one + 2, `${one}, ${both}`);
+    await button(page, "Undo").click();
+    assert.equal(await painted(), one);
+    await button(page, "Undo").click();
+    assert.equal(await painted(), 0);
+    await button(page, "Redo").click();
+    await button(page, "Redo").click();
+    assert.equal(await painted(), both);
+    assert.equal(await page.getByTestId("outline").count(), 1);
+    await picture(page, "edit-painted");
+    assert.deepEqual(await seriousFindings(page), []);
+
+    await save(page, "painted");
+    const { label_names, edits } = await scene("painted");
+    assert.ok(Object.values(label_names).includes("lesion"), JSON.stringify(label_names));
+    const { shapes } = JSON.parse(edits[0]);
+    assert.equal(shapes.length, both);
+    const apart = shapes.slice(1, one).map(({ centre_mm }, i) => Math.hypot(...centre_mm.map((value, axis) => value - shapes[i].centre_mm[axis])));
+    assert.ok(shapes.every(({ radius_mm }) => radius_mm === 3) && apart.every((way) => Math.abs(way - 1.5) < 0.05), String(apart));
+    assert.deepEqual(page.faults, []);
   });
 
   it("are moved by keys, and by a handle in space", async () => {

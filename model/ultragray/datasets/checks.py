@@ -479,6 +479,12 @@ def _shaken(dataset: Dataset) -> list[str]:
             f"the calibration from the image to the probe seems to be off by {shift_mm:.1f} mm in the middle of the "
             f"image and {turn_deg:.1f}°: with another one, which a training takes, sweeps that cross agree better"
         )
+    if (crossing := path.crossing) is not None:
+        found.append(
+            "passes that cross do not fit: what one shows and another predicts has a correlation of "
+            f"{crossing.before:.2f}; the tracker wanders, or tissue was pressed (a training moves frames smoothly, by "
+            f"{crossing.shift_mm:.1f} mm root mean square, and has {crossing.after:.2f})"
+        )
     if path.in_time_db < path.tracked_db + SHAKEN_DB:
         return found
     noise, gain_db = path.noise, path.found_db - path.tracked_db

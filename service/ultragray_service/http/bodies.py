@@ -64,6 +64,7 @@ class Apart:
     max_bytes: float = math.inf  # of the whole body
     max_values: float = MAX_VALUES
     max_characters: int = INLINE_BYTES  # of the texts of an element
+    max_element_values: int = _ELEMENT_VALUES
     max_other_characters: int = INLINE_BYTES  # of the texts beside them
 
 
@@ -121,8 +122,8 @@ def _small(value: Any, cls: type[T], most_characters: int) -> T:
 
 def _element(apart: Apart, index: int, value: Any) -> Any:
     path = f"{apart.key}[{index}]"
-    if not _is_small(value, _ELEMENT_VALUES, apart.max_characters):
-        raise apart.error(f"{path} must hold at most {_ELEMENT_VALUES} values", field=path)
+    if not _is_small(value, apart.max_element_values, apart.max_characters):
+        raise apart.error(f"{path} must hold at most {apart.max_element_values} values", field=path)
     try:
         return read_json(json.dumps(value), apart.element)
     except UltragrayError as error:
@@ -296,7 +297,9 @@ class RecipeBody(RecipeTarget):
 
 
 RECIPE_MAP = Apart("label_map", str, max_other_characters=2**26, max_bytes=2**27)
-EDITS = Apart("edits", list, Edit, max_characters=2**26, max_bytes=2**27)
+EDITS = Apart(
+    "edits", list, Edit, max_characters=2**26, max_element_values=2 * MAX_VALUES, max_bytes=2**27
+)  # the strokes of a brush are thousands of spheres
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,6 +52,14 @@ def test_an_edit_makes_a_scene_that_names_its_parent_and_what_was_put_in(http):
     assert again.json()["reason"] == "SCENE_EXISTS"
 
 
+def test_the_strokes_of_a_brush_are_one_edit(http):
+    spheres = [{"kind": "sphere", "centre_mm": [0.002 * i - 10, 0, 12], "radius_mm": 2} for i in range(10_000)]
+    edit = {"kind": "relabel", "label": "painted", "shapes": spheres}
+    answer = http.post("/v1/scenes/demo:edit", json={"into": "painted", "edits": [edit]})
+    assert answer.status_code == 201, answer.text
+    assert list(answer.json()["label_names"].values()) == ["painted"]
+
+
 def test_grpc_takes_every_kind_of_shape_and_merges_scenes_of_the_service(service, http):
     assert http.post("/v1/scenes/demo:edit", json={"into": "left", "edits": [CUT]}).status_code == 201
     right = {"into": "right", "edits": [{**CUT, "keep": "outside"}]}

@@ -4,7 +4,7 @@ import { type Edit, EDIT_KINDS, editScene, MOST_EDITS, type Shape, shapesOf, wit
 import { defaultsOf } from "../api/described";
 import { pointOf } from "../geometry/plane";
 import { apply, axis, type Vector } from "../geometry/pose";
-import { isSolid, movedTo, shapeAt, type Solid } from "../geometry/shapes";
+import { isSolid, movedTo, shapeAt, type Solid, type Sphere, spheresTo } from "../geometry/shapes";
 import { href, router } from "../page/router.svelte";
 import { service } from "../page/service.svelte";
 import { poseValue } from "../session/link";
@@ -20,6 +20,12 @@ export class Editing extends Attempt {
   isPrivate = $state(false);
   /** Whether a press on the image puts the shape that is worked on there. */
   places = $state(true);
+  /** Whether dragging across the image paints what is relabelled, with a brush of that radius. */
+  paints = $state(true);
+  brush_mm = $state(4);
+  /** What is painted, until the brush is lifted. */
+  #stroke = $state.raw<readonly Sphere[]>([]);
+  readonly isPainted = $derived.by(() => this.paints && this.edits.current?.kind === "relabel");
   #shape = $state(0);
   readonly shapes = $derived.by(() => (this.edits.current === null ? [] : shapesOf(this.edits.current)));
   /** Which of the shapes of the edit that is worked on is. */
@@ -27,10 +33,16 @@ export class Editing extends Attempt {
   /** The one that is placed by hand, where there is one. */
   readonly held = $derived.by((): Solid | null => {
     const shape = this.shapes[this.shape];
-    return shape !== undefined && isSolid(shape) ? shape : null;
+    return shape !== undefined && isSolid(shape) && !this.isPainted ? shape : null;
   });
-  /** All that can be drawn. */
-  readonly solids = $derived.by(() => this.edits.all.flatMap(shapesOf).filter(isSolid));
+  /** All that can be drawn, by edits: `isCurrent`: of the one that is worked on. */
+  readonly bodies = $derived.by(() =>
+    this.edits.all.map((edit, index) => {
+      const isCurrent = index === this.edits.chosen;
+      return { isCurrent, solids: [...shapesOf(edit).filter(isSolid), ...(isCurrent ? this.#stroke : [])] };
+    }),
+  );
+  readonly solids = $derived.by(() => this.bodies.flatMap(({ solids }) => solids));
 
   constructor(readonly session: Session) {
     super();
@@ -47,7 +59,7 @@ export class Editing extends Attempt {
     const shape = this.shapeOf(kind === "cut" ? "box" : "sphere");
     const begun: Record<string, unknown> = {
       shape,
-      shapes: [shape],
+      shapes: this.paints ? [] : [shape],
       scene: service.usable.find(({ name }) => name !== this.session.name)?.name ?? "",
       gaussian_count: Math.round((this.session.scene.description?.gaussian_count ?? 2) / 2),
     };
@@ -76,6 +88,19 @@ export class Editing extends Attempt {
   /** Puts it into the image. */
   putInImage(): void {
     this.putAt(this.#middle());
+  }
+
+  /** Leads the brush to a place, from where it was put down or led to before. */
+  paintTo(place: Vector): void {
+    this.#stroke = [...this.#stroke, ...spheresTo(place, this.brush_mm, this.#stroke.at(-1) ?? null)];
+  }
+
+  /** Lifts the brush: the stroke becomes a part of the edit. */
+  endStroke(): void {
+    const { current } = this.edits;
+    if (this.#stroke.length > 0 && current?.kind === "relabel")
+      this.edits.changeInOneStep({ ...current, shapes: [...current.shapes, ...this.#stroke] });
+    this.#stroke = [];
   }
 
   /** Has the service make the scene, and opens it where the probe is. */

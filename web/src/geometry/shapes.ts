@@ -8,6 +8,7 @@ import {
 
 /** A shape whose surface its numbers tell; those of files and of labels the service alone knows. */
 export type Solid = Exclude<Shape, { data: string } | { name: string }>;
+export type Sphere = Extract<Solid, { kind: "sphere" }>;
 export type Ellipsoid = Extract<Solid, { kind: "ellipsoid" }>;
 type Triple = [number, number, number];
 
@@ -72,8 +73,10 @@ export function poseOfEllipsoid({ centre_mm, turn_deg }: Ellipsoid): Pose {
 /** How far a point lies from the surface, negative inside; of an ellipsoid to first order, as the service has it. */
 export function distanceTo(solid: Solid): (point: Vector) => number {
   switch (solid.kind) {
-    case "sphere":
-      return (point) => length(minus(point, solid.centre_mm)) - solid.radius_mm;
+    case "sphere": {
+      const { centre_mm: [x, y, z], radius_mm } = solid;
+      return ([a, b, c]) => Math.sqrt((a - x) ** 2 + (b - y) ** 2 + (c - z) ** 2) - radius_mm; // of hundreds, at thousands of points
+    }
     case "ellipsoid": {
       const [into, [a, b, c]] = [inverse(poseOfEllipsoid(solid)), solid.radii_mm];
       const shrunk = ([x, y, z]: Vector): Vector => [x / a, y / b, z / c];
@@ -93,6 +96,21 @@ export function distanceTo(solid: Solid): (point: Vector) => number {
     case "tube":
       return (point) => Math.min(...solid.points_mm.slice(1).map((to, i) => distanceToPiece(point, solid.points_mm[i]!, to))) - solid.radius_mm;
   }
+}
+
+/** How far a point lies from what shapes cover together, negative inside. */
+export function distanceToAny(solids: readonly Solid[]): (point: Vector) => number {
+  const distances = solids.map(distanceTo);
+  return (point) => distances.reduce((least, distance) => Math.min(least, distance(point)), Infinity);
+}
+
+/** Spheres of a brush on its way to a point, half a radius from each other; without a last one, that at the point. */
+export function spheresTo(to: Vector, radius_mm: number, last: Sphere | null): Sphere[] {
+  const sphere = (at: Vector): Sphere => ({ kind: "sphere", centre_mm: rounded(at), radius_mm });
+  if (last === null) return [sphere(to)];
+  const [way, step] = [minus(to, last.centre_mm), radius_mm / 2];
+  const count = Math.floor(length(way) / step);
+  return Array.from({ length: count }, (_, index) => sphere(plus(last.centre_mm, scaled(way, ((index + 1) * step) / length(way)))));
 }
 
 function distanceToPiece(point: Vector, from: Vector, to: Vector): number {

@@ -174,7 +174,12 @@ export class WorkList<T> {
 
   /** Puts a changed one in the place of that which is worked on. */
   change(changed: T): void {
-    this.#change(this.all.map((before, index) => (index === this.chosen ? changed : before)), `${this.what} ${this.chosen}`);
+    this.#put(changed, `${this.what} ${this.chosen}`);
+  }
+
+  /** `change`, as a step of its own. */
+  changeInOneStep(changed: T): void {
+    this.#put(changed, null);
   }
 
   remove(index: number): void {
@@ -187,6 +192,10 @@ export class WorkList<T> {
   take(all: readonly T[]): void {
     this.all = all;
     this.#chosen = 0;
+  }
+
+  #put(changed: T, run: string | null): void {
+    this.#change(this.all.map((before, index) => (index === this.chosen ? changed : before)), run);
   }
 
   /** Changes of one `run` are one step. */

@@ -340,10 +340,11 @@ const SOLID_COLOURS = { held: 0xffd60a, other: 0xb09a3c };
 /** Shapes of edits, pale, and seen through what is before them; `held`: the one that is worked on. */
 export function solidBodies(solids: readonly Solid[], held: Solid | null): Group {
   const bodies = new Group();
+  const pale = { transparent: true, opacity: TRACE.opacity, depthTest: false, depthWrite: false };
+  const [bright, dim] = [SOLID_COLOURS.held, SOLID_COLOURS.other].map((color) => new MeshLambertMaterial({ color, ...pale }));
   for (const solid of solids) {
-    const color = solid === held ? SOLID_COLOURS.held : SOLID_COLOURS.other;
     for (const part of partsOfSolid(solid)) {
-      part.material = new MeshLambertMaterial({ color, transparent: true, opacity: TRACE.opacity, depthTest: false, depthWrite: false });
+      part.material = solid === held ? bright! : dim!;
       part.renderOrder = TRACE.order;
       bodies.add(part);
     }
@@ -380,8 +381,11 @@ function partsOfSolid(solid: Solid): Mesh[] {
   }
 }
 
+const UNIT_BALL = new SphereGeometry(1, 2 * SIDES, SIDES); // of all: a brush leaves hundreds
+
 function ball(centre_mm: Vector, radius_mm: number): Mesh {
-  const body = new Mesh(new SphereGeometry(radius_mm, 2 * SIDES, SIDES));
+  const body = new Mesh(UNIT_BALL);
   body.position.set(...centre_mm);
+  body.scale.setScalar(radius_mm);
   return body;
 }

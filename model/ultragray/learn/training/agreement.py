@@ -12,10 +12,12 @@ frame is predicted from two about it in its sweep, in space, and of these paths 
   of the turn about the elevation axis. 1: tissue is rigid; 0: it stays where it is in the image, and the frames are a
   straight stack along their path;
 - that, evened out across the image plane: where images have no exact times, or a tracker repeats its poses, the probe
-  seems to hasten and to halt from one frame to the next, which is no white noise.
+  seems to hasten and to halt from one frame to the next, which is no white noise;
+- that, with a smooth motion of each pass by which passes agree where they cross (`crossing`).
 
-Another path than the tracked one has to predict better, by LEAST_GAIN_DB, GAIN_OF_SHARES_DB or GAIN_OF_EVENNESS_DB. Of
-motion across the plane the images of one sweep say little: there the smoothness of the path is most of the evidence.
+Another path than the tracked one has to predict better, by LEAST_GAIN_DB, GAIN_OF_SHARES_DB or GAIN_OF_EVENNESS_DB; the
+last of them, which other passes speak for, may predict neighbours worse by LOSS_OF_CROSSING_DB. Of motion across the
+plane the images of one sweep say little: there the smoothness of the path is most of the evidence.
 Free of torch, since data sets are checked without it.
 """
 
@@ -41,12 +43,14 @@ from ultragray.learn.training.alignment import (
     tracker_noise,
     without_noise,
 )
+from ultragray.learn.training.crossing import Agreement, crossing_agreement
 from ultragray.learn.training.delay import found_delay_s, with_delay
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
 LEAST_GAIN_DB = 0.05  # of a path without noise
 EVEN_FRAMES = 4.0  # standard deviation of the Gaussian that evens out the steps from frame to frame
 GAIN_OF_EVENNESS_DB = 0.03  # where poses are exact, it loses
+LOSS_OF_CROSSING_DB = 0.1  # within the passes, for their agreement
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
 FAR = 4  # frames away from the one that is predicted
@@ -75,6 +79,7 @@ class AgreedPath:
     noise: TrackerNoise  # of the tracker
     delay_s: float  # of the images behind their poses, which is taken off
     calibration: FloatArray  # [4, 4] right-multiplied to the poses, mm: the identity where none is better
+    crossing: Agreement | None  # of its passes; None where they agree as they are, or do not cross
 
     def of(self, dataset: Dataset) -> Dataset:
         """The same frames on this path; the dataset itself where that is as tracked."""
@@ -122,8 +127,13 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     even = evened(found, ranges, train.probe)
     if (db := judge.psnr_db(even[on_path])) > found_db + GAIN_OF_EVENNESS_DB:
         found, found_db = even, db
+    if (crossing := crossing_agreement(train, found, ranges, on_path)) is not None:
+        if (db := judge.psnr_db((found @ crossing.motions)[on_path])) >= found_db - LOSS_OF_CROSSING_DB:
+            found, found_db = found @ crossing.motions, db
+        else:
+            crossing = None
     noise = tracker_noise(given, ranges)
-    figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
+    figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration, crossing
     if found is given:
         return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if known is not None:

@@ -271,7 +271,7 @@ class _Match:
         if not _has_enough(self._crossings(here)):
             return None  # any agreement found elsewhere would be chance
         for level in levels:
-            correlation = partial(self._correlation, [_detail(sweep, *level.pixels) for sweep in self._sweeps])
+            correlation = partial(self._correlation, [detail(sweep, *level.pixels) for sweep in self._sweeps])
             here = _climbed(correlation, here, level)
             reached = correlation(here)
             gain = reached - correlation(np.zeros(_OVERLAP_NUMBERS))
@@ -305,7 +305,7 @@ class _Match:
     def _crossing(self, side: int, poses: FloatArray, others: FloatArray) -> _Crossing:
         local, own = self._probe.points_mm(self._rows[side], self._columns[side]), poses[self._frames[side]]
         points = np.einsum("pij,pj->pi", own[:, :3, :3], local) + own[:, :3, 3]
-        planes, distances = _nearest_planes(points, others)
+        planes, distances = nearest_planes(points, others)
         seen = np.einsum("spi,spij->spj", points - others[planes, :3, 3], others[planes, :3, :3])
         rows, columns = self._probe.image_coordinates(seen[..., 0], seen[..., 2])
         known = np.flatnonzero((~np.isnan(rows) & (distances < self._gap_mm)).all(axis=0))
@@ -366,7 +366,7 @@ def _has_enough(crossings: Sequence[_Crossing]) -> bool:
     return sum(len(crossing.points) for crossing in crossings) >= LEAST_POINTS * 2 * POINTS
 
 
-def _nearest_planes(points: FloatArray, poses: FloatArray) -> tuple[IntArray, FloatArray]:  # [P, 3], [F, 4, 4]
+def nearest_planes(points: FloatArray, poses: FloatArray) -> tuple[IntArray, FloatArray]:  # [P, 3], [F, 4, 4]
     """The nearest of the image planes on either side of each point, and its distance, mm: [2, P] both.
 
     The distance is infinite where there is no plane on that side.
@@ -397,12 +397,12 @@ def _climbed(score: Callable[[FloatArray], float], start: FloatArray, level: Lev
     return here
 
 
-def _detail(sweep: Sweep, blur: float, around: float) -> HalfArray:  # [F, H, W]
+def detail(sweep: Sweep, blur: float, around: float) -> HalfArray:  # [F, H, W]
     """Structure wider than one standard deviation and narrower than the other, in pixels."""
     details = np.empty(sweep.images.shape, np.float16)
-    for image, detail in zip(sweep.images, details, strict=True):
+    for image, found in zip(sweep.images, details, strict=True):
         grey = image / np.float32(255.0)
-        detail[:] = _blurred(grey, blur) - _blurred(grey, around)
+        found[:] = _blurred(grey, blur) - _blurred(grey, around)
     return details
 
 

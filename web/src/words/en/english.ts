@@ -243,6 +243,7 @@ const sentences = {
   edit: {
     gone: (scene: string): string => `${scene} (not here any more)`,
     remove: (number: number): string => `Remove edit ${number}`,
+    painted: (count: number): string => (count === 1 ? "1 shape" : `${count} shapes`),
   },
   plan: {
     found: (count: number, before: string, after: string, path_mm: string): string =>
