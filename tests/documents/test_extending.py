@@ -120,7 +120,7 @@ def tree(tmp_path_factory):
     return copy
 
 
-@pytest.mark.long
+@pytest.mark.lengthy
 def test_the_page_is_true(tree):
     for step in STEPS:
         step.apply(tree)
