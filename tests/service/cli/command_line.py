@@ -1,5 +1,6 @@
 """The command line in this process, or as a fresh one."""
 
+import logging
 import sys
 
 import numpy as np
@@ -12,7 +13,13 @@ from ultragray_service.cli.app import app
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    try:
+        return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    finally:  # serve logs to the stream of this call, which is closed when a later test logs
+        root.handlers[:] = handlers
+        root.setLevel(level)
 
 
 def succeeded(*arguments):
