@@ -92,6 +92,7 @@ _BESIDE = {"favicon.svg": "image/svg+xml", "licences.txt": "text/plain"}  # the 
 _HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
 _POLICY = (
     "default-src 'self'",
+    "script-src 'self' 'wasm-unsafe-eval'",  # the renderer is compiled once, for all workers of the page
     "img-src 'self' blob:",  # frames, and files that are saved
     "object-src 'none'",
     "base-uri 'none'",
@@ -106,7 +107,7 @@ _PAGE_HEADERS = {
     "Cache-Control": "no-cache",
 }
 _ASSET_HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "public, max-age=31536000, immutable"}
-# A worker has the policy of its own file: it alone compiles WebAssembly, which the page may not.
+# A worker has the policy of its own file.
 _PACKAGE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'",
     "X-Content-Type-Options": "nosniff",
