@@ -58,8 +58,9 @@ def swept(steps):
 
 def test_a_frame_in_c_is_that_of_python_and_nothing_leaks(built, python_scene, tmp_path):
     picture = tmp_path / "frame.pgm"
-    ran = subprocess.run([*LEAKS, built / "frame", DEMO_FILE, picture], capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
+    for watched in (LEAKS, []):  # valgrind has no AVX-512: the picture of the second run stays
+        ran = subprocess.run([*watched, built / "frame", DEMO_FILE, picture], capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr
     pose = np.eye(4)
     pose[1, 3] = 19.0
     shown, (extrapolation,) = of_python(python_scene, {"height": 384, "width": 384}, pose[None])
@@ -85,8 +86,9 @@ def test_a_program_that_pkg_config_finds_the_library_for(installed, tmp_path):
 
 
 def test_a_sweep_in_cpp_is_that_of_python_and_nothing_leaks(built, python_scene):
-    ran = subprocess.run([*LEAKS, built / "sweep", DEMO_FILE, "3"], capture_output=True)
-    assert ran.returncode == 0, ran.stderr
+    for watched in (LEAKS, []):
+        ran = subprocess.run([*watched, built / "sweep", DEMO_FILE, "3"], capture_output=True)
+        assert ran.returncode == 0, ran.stderr
     shown, _ = of_python(python_scene, {"height": 128, "width": 96}, swept(3))
     assert ran.stdout == shown["bmode"].tobytes()
 

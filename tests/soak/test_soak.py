@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 
+import httpx
 import pytest
 
 from ultragray.datasets import Dataset
@@ -25,6 +26,7 @@ from ..processes import Growth, by_role, family
 from ..service.conftest import service_starter
 from ..service.igtl.conftest import address_of
 from ..surroundings import ROOT
+from ..waiting import wait_until
 from .place import STEADY, Place, frames_of, make_scenes
 from .visitors import VISITORS
 
@@ -113,6 +115,7 @@ def place(tmp_path, tmp_path_factory):
     service = next(starter)(
         cold=True, data_folder=data, artifact_folder=tmp_path / "artifacts", igtl_port=0, embedded_worker=True
     )
+    wait_until(lambda: httpx.get(f"{service.http}/v1/workers").json()["workers"])  # started whole: it is measured
     yield Place(
         service,
         address_of(service),

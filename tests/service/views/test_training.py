@@ -47,7 +47,7 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http):
     curve = http.get(f"/v1/jobs/{job}/curve").json()
     points = curve["points"]
     assert [point["step"] for point in points] == list(range(1, 31))
-    assert set(curve["baselines"]) == {"linear", "median"}
+    assert set(curve["baselines"]) == {"linear", "in-time", "median"}
     assert all(5.0 < psnr_db < 60.0 for psnr_db in curve["baselines"].values())
     assert any(point["val_psnr_db"] for point in points)
     assert http.get(f"/v1/jobs/{job}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"

@@ -27,12 +27,12 @@ DISK_BYTES = 8 * 2**20
 DIVERGENCE = """
 import sys
 if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
-    from ultragray.learn.training import trainer
-    image_loss, calls = trainer.image_loss, []
+    from ultragray.learn.training import batch
+    image_loss, calls = batch.image_loss, []
     def broken(rendered, truth, *settings):
         calls.append(None)
         return image_loss(rendered, truth, *settings) * (float("nan") if len(truth) == 3 and len(calls) > 2 else 1.0)
-    trainer.image_loss = broken
+    batch.image_loss = broken
 """
 
 
