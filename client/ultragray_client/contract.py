@@ -918,7 +918,9 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class MoveEdit(Motion):
-    """Moves the scene with its training poses, or a part of it alone."""
+    """Moves the scene with its training poses and modes of motion, or a part of it alone, which counts as not recorded
+    from then on.
+    """
 
     kind: Literal["move"] = field_of(default="move", repr=False, kw_only=True)
     shape: Shape | None = None  # The part: Gaussians whose middle lies in it. Default: all, and the poses.
@@ -939,7 +941,7 @@ class MergeEdit(Motion):
 
     Which of the two shows at a place is decided by whose training images are nearer; where both are near, both show,
     each with half of its volume. Where neither was cut apart from the other, what was joined is then fitted to frames
-    of both.
+    of both. Modes of motion are left out.
     """
 
     kind: Literal["merge"] = field_of(default="merge", repr=False, kw_only=True)

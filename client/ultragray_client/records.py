@@ -87,7 +87,7 @@ class Scene:
     private: bool  # others do not see it
     parents: Mapping[str, str]  # SHA-256 by name of the scenes that edits made it of
     edits: tuple[str, ...]  # what was done to them, each in JSON
-    made_labels: tuple[str, ...]  # of what was put in, and never recorded
+    made_labels: tuple[str, ...]  # of what was never recorded: put in, made or moved
 
 
 def entry_from_message(message: scenes_pb2.SceneEntry) -> SceneEntry:

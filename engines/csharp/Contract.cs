@@ -1127,9 +1127,9 @@ namespace Ultragray
         public bool Private { get; set; }
         /// <summary>SHA-256 by name of the scenes that edits made it of; empty: it was trained.</summary>
         public Dictionary<string, string> Parents { get; set; }
-        /// <summary>What was done to them, each in JSON.</summary>
+        /// <summary>What was done to them, each in JSON; `left_out`: what it did not keep.</summary>
         public string[] Edits { get; set; }
-        /// <summary>Names of the labels of what was put in, and never recorded.</summary>
+        /// <summary>Names of the labels of what was never recorded: put in, made or moved.</summary>
         public string[] MadeLabels { get; set; }
         public void Read(JsonReader json)
         {

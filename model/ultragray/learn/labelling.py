@@ -83,8 +83,9 @@ def label_by_frames(
             weights[shown != frame.labels] = CORRECTION
         _add_votes(votes, painted, scene, probe, frame, weights, backend)
         labels, voted = _decided(votes, painted, scene)
-        labelled = _with_labels(scene, labels, known)  # the next frame is held against what these say
-    return _with_labels(scene, _spread(scene, labels, voted, within_mm), known)
+        # The next frame is held against what these say.
+        labelled = with_labels(scene, labels, known, made=np.zeros(len(labels), bool))
+    return with_labels(scene, _spread(scene, labels, voted, within_mm), known)
 
 
 def label_by_map(
@@ -123,10 +124,10 @@ def label_by_map(
             "no Gaussian of the scene lies in the label map: is it registered to the frame of the scene, in mm?",
             field="label_map",
         )
-    labels = _labels_of(scene)
+    labels = labels_of(scene)
     labels[inside] = volume[tuple(places[inside].astype(np.int64).T)]
     known |= {label: f"label {label}" for label in np.unique(labels).tolist() if label and label not in known}
-    return _with_labels(scene, _spread(scene, labels, inside, within_mm), known)
+    return with_labels(scene, _spread(scene, labels, inside, within_mm), known)
 
 
 def same_but_for_labels(one: GaussianScene, other: GaussianScene) -> bool:
@@ -229,7 +230,7 @@ def _decided(
     """The label of each Gaussian, that of most votes or the one before, and whether it has votes."""
     most, place = votes.max(dim=1)
     voted = (most > 0.0).cpu().numpy()
-    return np.where(voted, painted[place.cpu().numpy()], _labels_of(scene)), voted
+    return np.where(voted, painted[place.cpu().numpy()], labels_of(scene)), voted
 
 
 def _spread(
@@ -272,16 +273,54 @@ def undirected_echo(scene: GaussianScene) -> npt.NDArray[np.float32]:  # [N] in 
     return activated.numpy()
 
 
-def _labels_of(scene: GaussianScene) -> LabelArray:  # [N]
+def labels_of(scene: GaussianScene) -> LabelArray:  # [N], 0: none
     if scene.labels is None:
         return np.zeros(len(scene.means), np.uint8)
     labels: LabelArray = scene.labels.cpu().numpy().copy()
     return labels
 
 
-def _with_labels(scene: GaussianScene, labels: LabelArray, names: Mapping[int, str]) -> GaussianScene:
-    """The same scene with other labels; with none at all where no label has a name."""
+def not_recorded(scene: GaussianScene) -> BoolArray:  # [N]
+    """The Gaussians that stand for nothing that was recorded."""
+    made: BoolArray = np.isin(labels_of(scene), scene.info.made_labels)
+    return made
+
+
+def with_labels(
+    scene: GaussianScene,
+    labels: LabelArray,  # [N]
+    names: Mapping[int, str],
+    made: BoolArray | None = None,  # [N]
+) -> GaussianScene:
+    """The same scene with other labels; with none at all where no label has a name.
+
+    `made`: the Gaussians that nobody recorded; None: those of the scene. They are told by their labels alone: where
+    recorded ones have the same label, or there is none, those that are made get one of their own, NAME (not recorded).
+    Raises InvalidArgument where no number is free for that.
+    """
+    made = not_recorded(scene) if made is None else made
+    labels, names = labels.copy(), dict(names)
+    for label in np.unique(labels[made]).tolist():
+        own, name = made & (labels == label), names.get(label, "")
+        while not label or (labels[~made] == label).any():
+            name = f"{name} (not recorded)" if name else "not recorded"
+            label = label_number(names, name)
+            names[label] = name
+        labels[own] = label
     if not names:
         return replace(scene, labels=None, info=replace(scene.info, label_names={}))
+    provenance = scene.info.provenance
+    of_made = {*provenance.get("made", ()), *labels[made].tolist()} - {*labels[~made].tolist()}
+    if of_made or "made" in provenance:
+        provenance = {**provenance, "made": sorted(of_made)}
     on_device = torch.from_numpy(labels).to(scene.means.device)
-    return replace(scene, labels=on_device, info=replace(scene.info, label_names=dict(names)))
+    return replace(scene, labels=on_device, info=replace(scene.info, label_names=names, provenance=provenance))
+
+
+def label_number(names: dict[int, str], name: str) -> int:
+    """The number of a label, its own or a free one. Raises InvalidArgument where none is free."""
+    known = next((label for label, one in names.items() if one == name), None)
+    free = next((label for label in range(1, MAX_LABEL + 1) if label not in names and label != UNPAINTED), None)
+    if known is None and free is None:
+        raise InvalidArgument(f"the scene has all labels that there can be: none is free for {name!r}", field="label")
+    return known or free or 0

@@ -29,6 +29,7 @@ from ultragray.scene.shapes import LabelShape, TubeShape
 Field: TypeAlias = Callable[[Tensor], Tensor]  # points [N, 3] mm of the tissue at rest -> [N, 3] mm for one unit
 
 SAMPLES = 3  # of a field from one spline to the next, along each axis
+AT_ONCE = 1 << 15  # points at which splines are evaluated: 100 MB
 ROOM = 4  # modes that a vessel leaves room for
 LEAST_LABELLED = 20  # Gaussians of a vessel
 FOLD_MM, FOLD_STEPS = 1e-3, 100  # to which, and by how many steps, a field is inverted
@@ -120,6 +121,23 @@ def with_splines(scene: GaussianScene, mode: Mode, grid: Grid, coefficients: Ten
     info = with_summary(scene.info, scene.means.detach().double().numpy(), scene.sh_degree)
     moved = Moving(motion, torch.cat(fields).float().numpy())
     return replace(scene, info=replace(info, motion=motion), moving=moved)
+
+
+def with_moved_modes(scene: GaussianScene, moving: Moving, by: FloatArray) -> GaussianScene:  # [4, 4] mm
+    """A still scene with modes of one that a rigid motion led to where this lies. Raises as `with_splines`."""
+    motion, shift, turn = moving.motion, torch.from_numpy(by[:3, 3]), torch.from_numpy(by[:3, :3])
+    if np.array_equal(by[:3, :3], np.eye(3)):
+        x, y, z = (np.array(motion.origin_mm) + by[:3, 3]).tolist()
+        led = replace(moving, motion=replace(motion, origin_mm=(x, y, z)))
+        return replace(scene, info=replace(scene.info, motion=led.motion), moving=led)
+    for mode, coefficients in zip(motion.modes, torch.from_numpy(moving.coefficients), strict=True):
+        before = Displacement.on_grid(coefficients[None], motion.origin_mm, motion.spacing_mm)
+
+        def field(points: Tensor, before: Displacement = before) -> Tensor:
+            return torch.cat([before.at((some - shift) @ turn)[0] @ turn.T for some in points.split(AT_ONCE)])
+
+        scene, _ = with_mode(scene, mode, field, min(motion.spacing_mm))
+    return scene
 
 
 def _common_grid(scene: GaussianScene, spacing_mm: FloatArray) -> Grid:  # [3]

@@ -62,7 +62,9 @@ class Motion(Contract):
 
 @dataclass(frozen=True, kw_only=True)
 class MoveEdit(Motion, Edit):
-    """Moves the scene with its training poses, or a part of it alone."""
+    """Moves the scene with its training poses and modes of motion, or a part of it alone, which counts as not recorded
+    from then on.
+    """
 
     shape: Shape | None = described("The part: Gaussians whose middle lies in it. Default: all, and the poses.", None)
     kind: Literal["move"] = kind_field("move")
@@ -83,7 +85,7 @@ class MergeEdit(Motion, Edit):
 
     Which of the two shows at a place is decided by whose training images are nearer; where both are near, both show,
     each with half of its volume. Where neither was cut apart from the other, what was joined is then fitted to frames
-    of both.
+    of both. Modes of motion are left out.
     """
 
     scene: str = described("Name of the other scene.")

@@ -302,8 +302,8 @@ class Scene:
     owner: str | None = described("Who imported or trained it; null: nobody.")
     private: bool = described("Whether others may not see it.")
     parents: dict[str, str] = described("SHA-256 by name of the scenes that edits made it of; empty: it was trained.")
-    edits: list[str] = described("What was done to them, each in JSON.")
-    made_labels: list[str] = described("Names of the labels of what was put in, and never recorded.")
+    edits: list[str] = described("What was done to them, each in JSON; `left_out`: what it did not keep.")
+    made_labels: list[str] = described("Names of the labels of what was never recorded: put in, made or moved.")
 
     @property
     def bounds_min_mm(self) -> Position:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -16,6 +17,8 @@ from ultragray.learn.editing.insertion import draw_lesions, insert
 from ultragray.learn.editing.merging import merge, registered
 from ultragray.learn.editing.parts import moved_gaussians, part, rebuilt, stacked, with_label, within
 from ultragray.learn.editing.thinning import thin
+from ultragray.learn.labelling import labels_of, not_recorded, with_labels
+from ultragray.learn.motion_fields import with_moved_modes
 from ultragray.scene.edits import (
     CutEdit,
     Edit,
@@ -26,9 +29,11 @@ from ultragray.scene.edits import (
     RelabelEdit,
     ThinEdit,
     check_edits,
+    scenes_named,
 )
 from ultragray.scene.gaussians import GaussianScene
 
+MODES = "modes of motion"  # as the file of a scene names what an edit left out
 LOOKS_THE_SAME = ("relabel",)  # kinds whose frames are those of the parent: its metrics stay true
 
 
@@ -50,8 +55,12 @@ def edit_scene(
     parents = dict(names or {}) or {name: digest(one) for name, one in given.items()}
     edited, recorded = scene, []
     for index, edit in enumerate(edits):
+        is_moving = edited.moving is not None
         with under(f"edits[{index}]"):
             edited, done = _edited(edited, edit, others or {})
+        is_moving |= any(given[name].moving is not None for name in scenes_named([edit]))
+        if is_moving and edited.moving is None:
+            done[-1]["left_out"] = [MODES]
         recorded += done
     provenance = {"parents": parents, "edits": recorded, "made": [*edited.info.made_labels]}
     same = all(edit.kind in LOOKS_THE_SAME for edit in edits)
@@ -76,8 +85,8 @@ def _edited(
     if isinstance(edit, MergeEdit):
         if edit.scene not in others:
             raise InvalidArgument(f"scene must be one of those given, got {edit.scene!r}", field="scene")
-        other, motion = others[edit.scene].at_rest(), edit.motion
-        scene = scene.at_rest()
+        scene, other = (_still(one.at_rest()) for one in (scene, others[edit.scene]))
+        motion = edit.motion
         if edit.register:
             motion = registered(scene, other, motion)
         merged = merge(scene, _moved(other, motion), edit)
@@ -99,17 +108,26 @@ def _move(scene: GaussianScene, edit: MoveEdit) -> GaussianScene:
     inside = within(scene, edit.shape)
     if not inside.any():
         raise InvalidArgument("shape must hold Gaussians of the scene, it holds none", field="shape")
+    scene = with_labels(scene, labels_of(scene), scene.info.label_names, made=not_recorded(scene) | inside)
     there = part(scene, inside)
     there = rebuilt(there, moved_gaussians(there, edit.motion), there.labels)
     return there if inside.all() else stacked(scene, [part(scene, ~inside), there])
 
 
+def _still(scene: GaussianScene) -> GaussianScene:
+    """The scene without its modes of motion."""
+    return replace(scene, moving=None, info=replace(scene.info, motion=None))
+
+
 def _moved(scene: GaussianScene, motion: FloatArray) -> GaussianScene:  # [4, 4] mm
-    """The scene with its poses after a motion."""
+    """The scene with its poses and its modes of motion after a motion."""
     still = np.array_equal(motion, np.eye(4))
     if still:
         return scene
-    moved = rebuilt(scene, moved_gaussians(scene, motion), scene.labels)
+    moved = rebuilt(_still(scene), moved_gaussians(scene, motion), scene.labels)
+    if scene.moving is not None:
+        with suppress(InvalidArgument):  # no grid is fine enough for them and covers the turned scene
+            moved = with_moved_modes(moved, scene.moving, motion)
     poses, corrections, rest = scene.training_poses, scene.pose_corrections, scene.rest_poses
     return replace(
         moved,

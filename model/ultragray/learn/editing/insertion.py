@@ -32,9 +32,8 @@ from ultragray.learn.editing.parts import (
     split,
     stacked,
     with_echo,
-    with_label,
 )
-from ultragray.learn.labelling import undirected_echo
+from ultragray.learn.labelling import undirected_echo, with_labels
 from ultragray.rendering.frames import render
 from ultragray.rendering.volume_fields import sample_volume
 from ultragray.rendering.volumes import VolumeGrid
@@ -87,6 +86,13 @@ def _inserted(
             f"label must be new, or that of what was inserted before: {edit.label_name!r} was recorded", field="label"
         )
     radius = 0.5 * float((bounds[1] - bounds[0]).min())
+    away_mm = float(distance(means_mm(scene)).min())
+    if away_mm > max(_NEAR_MM, radius):
+        low, high = ([round(one) for one in corner] for corner in (scene.info.bounds_min_mm, scene.info.bounds_max_mm))
+        raise InvalidArgument(
+            f"shape must lie in the scene, from {low} to {high} mm, it is {away_mm:.0f} mm from the nearest Gaussian",
+            field="shape",
+        )
     around = _Around(distance, bounds, max(_NEAR_MM, radius))
     level, roughness = around.echo(scene)
     outside = _without(scene, radius, around)
@@ -108,11 +114,12 @@ def _inserted(
     attenuation = known.attenuation if edit.attenuation is None else edit.attenuation
     lost_db = 2.0 * edit.frequency_mhz * max(0.0, attenuation - SOFT_TISSUE_DB)  # dB/cm, there and back
     body = _attenuating(body, lost_db / (edit.dynamic_range_db * max(level, _DARK)), distance, bounds)
-    body = with_label(body, np.ones(len(body.means), bool), edit.label_name)
-    whole = body if outside is None else joined(outside, body)
-    number = next(label for label, name in whole.info.label_names.items() if name == edit.label_name)
-    made = sorted({*whole.info.made_labels, number})
-    return replace(whole, info=replace(whole.info, provenance={**whole.info.provenance, "made": made}))
+    count = len(body.means)
+    body = with_labels(body, np.ones(count, np.uint8), {1: edit.label_name}, made=np.ones(count, bool))
+    if outside is None:
+        told = {**scene.info.provenance, **body.info.provenance}
+        return rebuilt(scene, body.splats, body.labels, label_names=body.info.label_names, provenance=told)
+    return joined(outside, body)
 
 
 class _Around:

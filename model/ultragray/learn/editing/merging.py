@@ -48,12 +48,10 @@ def merge(scene: GaussianScene, other: GaussianScene, edit: MergeEdit) -> Gaussi
         is_shared |= bool((share < 1.0 - _LEAST_SHARE).any())
         parts.append(_shared(one, share, seed=place))
     whole = joined(*parts)
-    names = {name: label for label, name in whole.info.label_names.items()}
-    made = {names[one.info.label_names[label]] for one in parts for label in one.info.made_labels}
     info = replace(
         whole.info,
         confidence=_confidence(scene, other),
-        provenance={"made": sorted(made)} if made else {},
+        provenance={"made": list(whole.info.made_labels)},
         dataset_sha256=None,
     )
     poses = np.concatenate([scene.training_poses, other.training_poses])

@@ -14,11 +14,10 @@ from torch import Tensor
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import BoolArray, FloatArray
 from ultragray.geometry.rotations import turns_of
-from ultragray.learn.labelling import undirected_echo
+from ultragray.learn.labelling import label_number, labels_of, not_recorded, undirected_echo, with_labels
 from ultragray.learn.sweep import IntArray
 from ultragray.rendering.backends.reference import inverse_root_covariance, spherical_harmonics
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
-from ultragray.scene.info import MAX_LABEL, UNPAINTED
 from ultragray.scene.shapes import LabelShape, Shape
 
 Distance = Callable[[FloatArray], FloatArray]  # [N, 3] mm -> [N] mm, negative inside
@@ -74,6 +73,7 @@ def rebuilt(scene: GaussianScene, splats: dict[str, Tensor], labels: Tensor | No
         labels=labels,
         pose_corrections=scene.pose_corrections,
         rest_poses=scene.rest_poses,
+        moving=scene.moving,
     )
 
 
@@ -94,27 +94,13 @@ def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
             both = [torch.cat([one, one.new_zeros(len(one), degree - one.shape[1], 1)], dim=1) for one in both]
         splats[name] = torch.cat(both)
     names = dict(scene.info.label_names)
-    table = torch.zeros(256, dtype=torch.uint8)
+    table = np.zeros(256, np.uint8)
     for label, name in other.info.label_names.items():
         table[label] = number = label_number(names, name)
         names[number] = name
-    labels = [_labels(scene), table.to(like.device)[_labels(other).to(like.device).long()]]
-    return rebuilt(scene, splats, torch.cat(labels) if names else None, label_names=names)
-
-
-def _labels(scene: GaussianScene) -> Tensor:  # [N]
-    if scene.labels is not None:
-        return scene.labels
-    return torch.zeros(len(scene.means), dtype=torch.uint8, device=scene.means.device)
-
-
-def label_number(names: dict[int, str], name: str) -> int:
-    """The number of a label, its own or a free one. Raises InvalidArgument where none is free."""
-    known = next((label for label, one in names.items() if one == name), None)
-    free = next((label for label in range(1, MAX_LABEL + 1) if label not in names and label != UNPAINTED), None)
-    if known is None and free is None:
-        raise InvalidArgument(f"the scene has all labels that there can be: none is free for {name!r}", field="label")
-    return known or free or 0
+    labels = np.concatenate([labels_of(scene), table[labels_of(other)]])
+    made = np.concatenate([not_recorded(scene), not_recorded(other)])
+    return with_labels(rebuilt(scene, splats, None, label_names={}), labels, names, made)
 
 
 def with_label(scene: GaussianScene, chosen: BoolArray, name: str | None) -> GaussianScene:
@@ -122,9 +108,9 @@ def with_label(scene: GaussianScene, chosen: BoolArray, name: str | None) -> Gau
     names = dict(scene.info.label_names)
     number = 0 if name is None else label_number(names, name)
     names |= {} if name is None else {number: name}
-    labels = _labels(scene).clone()
-    labels[torch.from_numpy(chosen).to(labels.device)] = number
-    return rebuilt(scene, dict(scene.splats), labels if names else None, label_names=names)
+    labels = labels_of(scene)
+    labels[chosen] = number
+    return with_labels(scene, labels, names)
 
 
 def as_sigmoid(scene: GaussianScene) -> GaussianScene:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import BoolArray, FloatArray
-from ultragray.learn.editing.parts import as_sigmoid, label_number, means_mm
+from ultragray.learn.editing.parts import as_sigmoid, means_mm
+from ultragray.learn.labelling import with_labels
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
@@ -43,31 +44,21 @@ def started_parameters(start: GaussianScene, config: TrainingConfig, centre_mm: 
 def with_labels_of(start: GaussianScene, scene: GaussianScene, sweep: Sweep) -> GaussianScene:
     """A trained scene with the labels of its start, each Gaussian that of the nearest there.
 
-    What was made and no frame of the sweep shows keeps a label of its own among `made_labels`.
+    What was made and no frame of the sweep shows stays among `made_labels`.
     """
     provenance = {
         "parents": {"start": sha256(start.to_bytes()).hexdigest()},
         "edits": start.info.provenance.get("edits", []),
     }
+    scene = replace(scene, info=replace(scene.info, provenance=provenance))
     if start.labels is None:
-        return replace(scene, info=replace(scene.info, provenance=provenance))
+        return scene
     places = means_mm(scene).astype(np.float32)
     index = cv2.flann.Index(means_mm(start).astype(np.float32), {"algorithm": 4, "leaf_max_size": 16})
     nearest, _ = index.knnSearch(places, 1, params={"checks": -1})
     labels = start.labels.cpu().numpy()[nearest[:, 0]]
-    made = start.info.made_labels
-    names = {
-        label: f"{name} (not recorded)" if label in made else name for label, name in start.info.label_names.items()
-    }
-    is_shown = shown_by(sweep, places.astype(np.float64))
-    recorded = labels.copy()
-    for label in made:
-        own = (labels == label) & is_shown
-        if own.any():
-            number = label_number(names, start.info.label_names[label])
-            names[number], recorded[own] = start.info.label_names[label], number
-    info = replace(scene.info, label_names=names, provenance={**provenance, "made": list(made)})
-    return replace(scene, labels=torch.from_numpy(recorded), info=info)
+    made = np.isin(labels, start.info.made_labels) & ~shown_by(sweep, places.astype(np.float64))
+    return with_labels(scene, labels, start.info.label_names, made)
 
 
 def shown_by(sweep: Sweep, places: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]

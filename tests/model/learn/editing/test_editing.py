@@ -17,6 +17,8 @@ from ultragray.errors import InvalidArgument
 from ultragray.learn.editing.editor import digest, edit_scene
 from ultragray.learn.editing.insertion import insert
 from ultragray.learn.editing.parts import means_mm, part
+from ultragray.learn.labelling import PaintedFrame, label_by_frames, label_by_map, not_recorded
+from ultragray.learn.motion import add_motion
 from ultragray.phantom.demo import DEMO_PROBE, load_demo_scene
 from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.frames import render_shown
@@ -33,6 +35,8 @@ from ultragray.scene.edits import (
     edits_of,
     read_edits,
 )
+from ultragray.scene.modes import Mode, Motion, Moving
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray.scene.shapes import (
     BoxShape,
     EllipsoidShape,
@@ -46,6 +50,7 @@ from ultragray.scene.shapes import (
 from ultragray.scene.tissues import TISSUES
 
 SIDE = 96
+PAINTED = PaintedFrame(np.eye(4), np.ones((SIDE, SIDE), np.uint8))
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 MIDDLE = (1.0, 0.5, 20.0)
 
@@ -254,18 +259,154 @@ def test_texture_comes_from_a_place_of_the_scene(scene):
         edit_scene(scene, [replace(edit, texture_from_mm=(500.0, 0.0, 0.0))])
 
 
-def test_what_was_put_in_supports_no_confidence(scene):
-    shape = SphereShape(centre_mm=(0.0, 0.0, 20.0), radius_mm=9.0)
-    edited = edit_scene(scene, [InsertEdit(shape=shape)])
-    assert edited.info.made_labels == (1,)
-    settings = FrameSettings(height=SIDE, width=SIDE).resolved(edited.info, Encoding.FLOAT32)
-    shares = []
-    for one in (scene, edited):
-        assessor = Assessor(one.info, one.training_poses)
-        watch = SupportWatch(assessor, assessor.assess(np.eye(4)), settings)
-        render_shown(one, settings, np.eye(4)[None], support=watch)
-        shares.append(watch.completed(0, 1)[0].supported_share)
-    assert shares[0] - shares[1] == pytest.approx(np.pi * 9.0**2 / 40.0**2, abs=0.03)
+BALL = SphereShape(centre_mm=(0.0, 0.0, 20.0), radius_mm=9.0)
+AROUND = BoxShape(min_mm=(-15.0, -15.0, 5.0), max_mm=(15.0, 15.0, 35.0))
+BESIDE = SphereShape(centre_mm=(15.0, 0.0, 20.0), radius_mm=4.0)
+EVERYWHERE = np.ones((45, 45, 45), np.uint8), np.array([[1, 0, 0, -22], [0, 1, 0, -22], [0, 0, 1, -2], [0, 0, 0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def with_tumour(scene):
+    return edit_scene(scene, [InsertEdit(shape=BALL)])
+
+
+def supported_share(scene):
+    settings = FrameSettings(height=SIDE, width=SIDE).resolved(scene.info, Encoding.FLOAT32)
+    assessor = Assessor(scene.info, scene.training_poses)
+    watch = SupportWatch(assessor, assessor.assess(np.eye(4)), settings)
+    render_shown(scene, settings, np.eye(4)[None], support=watch)
+    return watch.completed(0, 1)[0].supported_share
+
+
+def test_what_was_put_in_supports_no_confidence(scene, with_tumour):
+    assert with_tumour.info.made_labels == (1,)
+    lost = supported_share(scene) - supported_share(with_tumour)
+    assert lost == pytest.approx(np.pi * 9.0**2 / 40.0**2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("relabel", "names", "made"),
+    [
+        ([RelabelEdit(shapes=(AROUND,), label="organ")], {"tumour", "organ", "organ (not recorded)"}, 2),
+        ([RelabelEdit(shapes=(AROUND,))], {"tumour", "not recorded"}, 2),
+        ([RelabelEdit(shapes=(BESIDE,), label="tumour")], {"tumour", "tumour (not recorded)"}, 1),
+        ([RelabelEdit(shapes=(LabelShape(name="tumour"),), label="cyst")], {"tumour", "cyst"}, 2),
+        (
+            [RelabelEdit(shapes=(AROUND,), label="organ"), RelabelEdit(shapes=(AROUND,), label="other")],
+            {"tumour", "organ", "organ (not recorded)", "other", "other (not recorded)"},
+            3,
+        ),
+        (lambda scene: label_by_map(scene, *EVERYWHERE, names={1: "organ"}), {"organ", "organ (not recorded)"}, 1),
+        (lambda scene: label_by_map(scene, 0 * EVERYWHERE[0], EVERYWHERE[1], names={}), {"tumour", "not recorded"}, 2),
+        (
+            lambda scene: label_by_frames(scene, [PAINTED, PAINTED], names={1: "bone"}, within_mm=3.0),
+            {"bone", "bone (not recorded)"},
+            1,
+        ),
+    ],
+    ids=["painted over", "unlabelled", "painted elsewhere", "renamed", "twice", "map", "empty map", "frames"],
+)
+def test_what_was_put_in_counts_as_not_recorded_whatever_its_label(with_tumour, relabel, names, made):
+    labelled = relabel(with_tumour) if callable(relabel) else edit_scene(with_tumour, relabel)
+    assert set(labelled.info.label_names.values()) == names
+    assert len(labelled.info.made_labels) == made
+    np.testing.assert_array_equal(not_recorded(labelled), not_recorded(with_tumour))
+    assert supported_share(labelled) == supported_share(with_tumour)
+
+
+def test_a_part_that_was_moved_counts_as_not_recorded(scene, with_tumour):
+    shift = {"shift_mm": (0.0, 0.0, 3.0)}
+    moved = edit_scene(scene, [MoveEdit(shape=BALL, **shift)])
+    assert (moved.info.label_names, moved.info.made_labels) == ({1: "not recorded"}, (1,))
+    assert not_recorded(moved).sum() == (BALL.distance_mm(means_mm(scene)) < 0.0).sum()
+    assert supported_share(moved) == supported_share(edit_scene(scene, [CutEdit(shape=BALL, keep="outside")]))
+    further = edit_scene(with_tumour, [MoveEdit(shape=AROUND, **shift)])
+    assert set(further.info.label_names.values()) == {"tumour", "not recorded"}
+    whole = edit_scene(with_tumour, [MoveEdit(**shift)])
+    np.testing.assert_array_equal(not_recorded(whole), not_recorded(with_tumour))
+
+
+def test_of_two_scenes_one_may_have_recorded_what_the_other_made(scene, with_tumour):
+    recorded = edit_scene(scene, [RelabelEdit(shapes=(BESIDE,), label="tumour")])
+    for one, other in ((with_tumour, recorded), (recorded, with_tumour)):
+        merge = MergeEdit(scene="other", fit_steps=0, match_gain=False)
+        merged = edit_scene(one, [merge], others={"other": other})
+        names = merged.info.label_names
+        assert [names[label] for label in merged.info.made_labels] == ["tumour (not recorded)"]
+        places = means_mm(merged)
+        assert (BALL.distance_mm(places[not_recorded(merged)]) < 0.5).all()
+        has_name = merged.labels.numpy() == next(label for label, name in names.items() if name == "tumour")
+        assert (BESIDE.distance_mm(places[has_name]) < 0.0).all()
+        assert has_name.any()
+
+
+def test_a_body_that_fills_the_whole_scene_keeps_what_its_frames_need(scene):
+    small = edit_scene(scene, [CutEdit(shape=SphereShape(centre_mm=MIDDLE, radius_mm=1.0))])
+    filled = edit_scene(small, [InsertEdit(shape=SphereShape(centre_mm=MIDDLE, radius_mm=6.0))])
+    np.testing.assert_array_equal(filled.training_poses, scene.training_poses)
+    assert not_recorded(filled).all()
+
+
+@pytest.fixture(scope="module")
+def breathing(scene):
+    return add_motion(scene, MotionSettings(chest_mm=6.0)).scene
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        InsertEdit(shape=SphereShape(centre_mm=(0.0, 0.0, 30.0), radius_mm=5.0)),
+        LesionsEdit(count=1, radius_min_mm=2.0, radius_max_mm=3.0),
+        CutEdit(shape=AROUND),
+        RelabelEdit(shapes=(BALL,), label="organ"),
+        ThinEdit(gaussian_count=8000),
+        MoveEdit(shape=BALL, shift_mm=(0.0, 0.0, 5.0)),
+    ],
+    ids=lambda edit: edit.kind,
+)
+def test_what_an_edit_leaves_and_makes_moves_as_the_tissue_there_did(breathing, edit):
+    edited = edit_scene(breathing, [edit])
+    assert edited.moving is breathing.moving
+    assert edited.info.motion == breathing.info.motion
+    assert "left_out" not in edited.info.provenance["edits"][0]
+
+
+def test_a_body_goes_with_the_breath(breathing):
+    edited = edit_scene(breathing, [InsertEdit(shape=SphereShape(centre_mm=(0.0, 0.0, 30.0), radius_mm=5.0))])
+    depths = []
+    for phase in (0.0, 1.0):
+        labels = frames(edited.at_phase([phase]), np.eye(4), ("labels",))[0].numpy()
+        depths.append((np.nonzero(labels)[0].mean() + 0.5) / SIDE * 40.0)
+    assert depths == pytest.approx([30.0, 36.0], abs=0.5)
+
+
+@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (20.0, -35.0, 10.0)], ids=["shifted", "turned"])
+def test_the_motion_of_a_scene_is_moved_with_it(breathing, turn_deg):
+    edit = MoveEdit(shift_mm=(4.0, -3.0, 2.0), turn_deg=turn_deg, about_mm=(1.0, 2.0, 3.0))
+    moved = edit_scene(breathing, [edit]).at_phase([0.8])
+    found, poses = frames(moved, moved.training_poses), breathing.training_poses
+    assert psnr_db(found, frames(breathing.at_phase([0.8]), poses)) > 45.0
+    assert psnr_db(found, frames(breathing, poses)) < 35.0
+
+
+def test_a_merge_tells_that_it_leaves_motion_out(scene, breathing):
+    merge = MergeEdit(scene="other", fit_steps=0, match_gain=False)
+    for one, other in ((scene, breathing), (breathing, scene)):
+        merged = edit_scene(one, [RelabelEdit(shapes=(BALL,), label="organ"), merge], others={"other": other})
+        assert merged.moving is None
+        assert merged.info.motion is None
+        assert [told.get("left_out") for told in merged.info.provenance["edits"]] == [None, ["modes of motion"]]
+    still = edit_scene(scene, [merge], others={"other": scene})
+    assert "left_out" not in still.info.provenance["edits"][0]
+
+
+def test_motion_that_no_grid_holds_any_more_is_left_out_of_a_turned_scene(breathing):
+    pulse = Motion((Mode("pulse", 0.0, 1.0),), origin_mm=(-22.0, -22.0, -2.0), spacing_mm=(0.85, 0.85, 0.85))
+    moving = Moving(pulse, np.zeros((1, 53, 53, 53, 3), np.float32))
+    fine = replace(breathing, moving=moving, info=replace(breathing.info, motion=pulse))
+    turned = edit_scene(fine, [MoveEdit(turn_deg=(0.0, 45.0, 0.0))])
+    assert turned.moving is None
+    assert turned.info.provenance["edits"][0]["left_out"] == ["modes of motion"]
 
 
 def test_lesions_are_drawn_within_what_was_seen_and_again_for_the_same_seed(scene):
@@ -367,7 +508,13 @@ def test_wrong_edits_are_refused_by_the_path_of_what_is_wrong(document, field):
 
 def test_edits_that_fit_no_scene_are_refused(scene):
     far = SphereShape(centre_mm=(500.0, 0.0, 0.0), radius_mm=5.0)
-    for edit in (CutEdit(shape=far), MoveEdit(shape=far), RelabelEdit(shapes=(far,)), MergeEdit(scene="unknown")):
+    for edit in (
+        CutEdit(shape=far),
+        MoveEdit(shape=far),
+        RelabelEdit(shapes=(far,)),
+        MergeEdit(scene="unknown"),
+        InsertEdit(shape=far),
+    ):
         with pytest.raises(InvalidArgument) as told:
             edit_scene(scene, [edit])
         assert told.value.field.startswith("edits")
