@@ -108,16 +108,12 @@ def add_motion(
     return Added(*with_mode(scene, Mode(name, 0.0, 1.0), field, spacing_mm), tube=tube)
 
 
-def read_numbers(path: str | Path, sweep: Sweep) -> Numbers:  # [F]
-    """The numbers of a sweep's frames from a file with one a line, one for each of the recording's.
-
-    Raises DatasetInvalid.
-    """
+def read_numbers(path: str | Path) -> Numbers:  # [R]
+    """The numbers of a recording's frames from a file with one a line. Raises DatasetInvalid."""
     try:
-        numbers = np.loadtxt(path, dtype=np.float64, ndmin=1, delimiter=",")
+        return np.loadtxt(path, dtype=np.float64, ndmin=1, delimiter=",")
     except (OSError, ValueError) as error:
         raise DatasetInvalid(f"{path}: {error}") from error
-    return numbers_of(sweep, numbers, str(path))
 
 
 def numbers_of(sweep: Sweep, numbers: npt.ArrayLike, source: str) -> Numbers:  # [R] of the recording -> [F]

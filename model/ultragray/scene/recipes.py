@@ -132,8 +132,8 @@ def read_recipe(path: Path | None, label_map: Path | None, ct: Path | None = Non
     Raises InvalidArgument, naming the field; OSError.
     """
     document = {} if path is None else read_document(path, "tissue")
-    if not isinstance(document, dict):
-        raise InvalidArgument(f"{path} must hold a table with bodies", field="tissue")
+    if not isinstance(document, dict) or "bodies" not in document:
+        raise InvalidArgument(f"{path or '--tissue'} must be a TOML or JSON file with a list of bodies", field="tissue")
     for name, file in (("label_map", label_map), ("ct", ct)):
         if file is not None:
             found = MapShape.of_file(file)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -80,6 +81,9 @@ class AskedEdits(Contract):
             found.append(LesionsEdit(count=self.lesions, seed=self.seed))
         if self.gaussians is not None:
             found.append(ThinEdit(gaussian_count=self.gaussians))
+        if not found:
+            known = "--edits, --cut-box-mm, --merge, --insert with --at-mm, --lesions, --gaussians"
+            raise InvalidArgument(f"at least one edit must be given: {known}", field="edits")
         return check_edits(found)
 
 
@@ -125,7 +129,14 @@ def edit(
         "made_labels": [edited.info.label_names[label] for label in edited.info.made_labels],
         "provenance": edited.info.provenance,
     }
-    tell(f"wrote {output}: {edited.gaussian_count:,} Gaussians, of {', '.join(parents)}", document, as_json=json)
+    words = f"wrote {output}: {edited.gaussian_count:,} Gaussians, of {', '.join(parents)}"
+    tell(words + left_out(edited.info.provenance["edits"]), document, as_json=json)
+
+
+def left_out(edits: Iterable[Mapping[str, Any]]) -> str:
+    """The end of a sentence about a scene that these edits made, as its file tells them: what they did not keep."""
+    names = dict.fromkeys(name for edit in edits for name in edit.get("left_out", ()))
+    return f"; left out: {', '.join(names)}" if names else ""
 
 
 _MAPS = ", ".join(LABEL_MAP_SUFFIXES)
@@ -135,7 +146,7 @@ LabelsArgument = Annotated[
 TissueOption = Annotated[
     Path | None,
     option(
-        "What its labels stand for, or shapes: TOML with tables [[bodies]], and any field of a recipe.",
+        r"What its labels stand for, or shapes: TOML with tables [\[bodies]], and any field of a recipe.",
         "--tissue",
         shown=False,
     ),

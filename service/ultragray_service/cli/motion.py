@@ -70,15 +70,16 @@ def motion(
 
     from ultragray import GaussianScene
     from ultragray.datasets.source import load_dataset
-    from ultragray.learn.motion import add_motion, read_numbers
+    from ultragray.learn.motion import add_motion, numbers_of, read_numbers
     from ultragray.learn.motion_fields import field_of_voxels
 
+    numbers = None if surrogate in (None, AUTO) else read_numbers(surrogate)
     loaded = GaussianScene.load(scene)
     sources: dict[str, Any] = {}
     if sweep is not None and surrogate is not None:
         train = sources["sweep"] = load_dataset(sweep).train
-        if surrogate != AUTO:
-            sources |= {"numbers": read_numbers(surrogate, train), "surrogate": Path(surrogate).name}
+        if numbers is not None:
+            sources |= {"numbers": numbers_of(train, numbers, surrogate), "surrogate": Path(surrogate).name}
     if voxels is not None and asked.field_leads is not None:
         to_scene = None if link is None else np.asarray(link.base_to_scene)
         sources["field"] = field_of_voxels(voxels, loaded.info, asked.field_leads, to_scene)

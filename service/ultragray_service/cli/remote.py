@@ -29,7 +29,14 @@ from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray.scene.label_maps import parse_names, read_label_map, read_painted
 from ultragray.scene.recipes import read_recipe
 from ultragray_service.cli.connection import Connection, Resource, route, with_connection
-from ultragray_service.cli.editing import RECIPE_FIELDS, AskedEdits, CtOption, LabelsArgument, TissueOption
+from ultragray_service.cli.editing import (
+    RECIPE_FIELDS,
+    AskedEdits,
+    CtOption,
+    LabelsArgument,
+    TissueOption,
+    left_out,
+)
 from ultragray_service.cli.labels import FramesOption, MapOption, NamesOption, WithinOption, check_source
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING
@@ -282,7 +289,12 @@ def edit_scene(
     """Have the service edit a scene, as another one that names its parents. Merged scenes are the service's, too."""
     body = {"into": into, "private": private, "edits": to_dict(edits.listed(), with_none=False)}
     scene = connection.json("POST", route("scenes", name, suffix=":edit"), body)
-    tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, of {', '.join(scene['parents'])}", scene, as_json=json)
+    words = f"made {into}: {scene['gaussian_count']:,} Gaussians, of {', '.join(scene['parents'])}"
+    tell(words + left_out(_edits_of(scene)), scene, as_json=json)
+
+
+def _edits_of(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [json.loads(edit) for edit in scene["edits"]]
 
 
 @scenes_app.command(

@@ -6,7 +6,7 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.learn.motion import find_motion, fit_motion, read_numbers
+from ultragray.learn.motion import find_motion, fit_motion, numbers_of, read_numbers
 from ultragray.learn.sweep import Sweep
 from ultragray.scene.info import SceneInfo
 
@@ -62,10 +62,10 @@ def test_numbers_that_are_none_or_too_few_are_refused(phantom, tmp_path):
     sweep = Sweep(images, np.tile(np.eye(4), (2, 1, 1)), PROBE, np.array([0, 2]), "phantom")
     path = tmp_path / "belt.csv"
     path.write_text("1.0\n2.0\n3.0\n")
-    assert read_numbers(path, sweep).tolist() == [1.0, 3.0]
+    assert numbers_of(sweep, read_numbers(path), "belt.csv").tolist() == [1.0, 3.0]
     path.write_text("1.0\n2.0\n")
     with pytest.raises(DatasetInvalid, match="each of 3 frames, got \\[2\\]"):
-        read_numbers(path, sweep)
+        numbers_of(sweep, read_numbers(path), "belt.csv")
     path.write_text("1.0\nbreath\n")
     with pytest.raises(DatasetInvalid, match=r"belt\.csv"):
-        read_numbers(path, sweep)
+        read_numbers(path)

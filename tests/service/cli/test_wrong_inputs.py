@@ -54,6 +54,10 @@ WRONG = {  # the command line, and a part of the line that it gives
     "voxelize scene.ugr -o s.png --plane-mm 0,0,nan --size-mm 9,9": "plane_mm must be 3 finite numbers",
     "voxelize scene.ugr -o s.png": "is for a slice: give plane_mm and size_mm",
     "voxelize scene.ugr -o v.nrrd --spacing-mm 0.01": "the limit is",
+    "edit scene.ugr -o a.ugr": "at least one edit must be given: --edits, --cut-box-mm",
+    "edit scene.ugr -o a.ugr --insert cyst --at-mm 500,0,0": "shape must lie in the scene, from [",
+    "from-labels -o a.ugr": "--tissue must be a TOML or JSON file with a list of bodies",
+    "from-labels -o a.ugr --tissue pose.json": "pose.json must be a TOML or JSON file with a list of bodies",
     "worker --artifact-folder . --device tpu": "device must be auto, cpu, cuda or cuda:N, got 'tpu'",
     "worker --artifact-folder . --label lab1": "--label takes NAME=VALUE, got 'lab1'",
     "eval scene.ugr sweep --split half": "--split must be one of val, train, got 'half'",
@@ -82,6 +86,7 @@ WRONG = {  # the command line, and a part of the line that it gives
     "show scene.ugr --crop 1:2,3:4": "options of sweeps are not for scene.ugr",
     "check none": "none: no such file or folder",
     "train none -o a.ugr": "none: no such file or folder",
+    "motion scene.ugr -o a.ugr --sweep none --surrogate none.csv": "none.csv not found",
     "import scene.ugr -o a.ugr": "import reads .ply and .pt files",
     "import none.ply -o a.ugr": "none.ply: no such file",
     "import notes.ply -o a.ugr": "notes.ply",
@@ -162,6 +167,7 @@ def place(tmp_path_factory):
     (folder / "notes" / "notes.txt").touch()
     noise_sweep(folder / "sweep")
     np.save(folder / "pose.npy", np.eye(4))
+    (folder / "pose.json").write_text("[]")
     for name in ("notes.txt", "notes.ugr", "notes.ply", "notes.pt", "kept.npz"):
         (folder / name).write_text("some notes, long enough to be looked at")
     return folder

@@ -7,6 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from ultragray import GaussianScene
+from ultragray.learn.motion import add_motion
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray_client import (
     BoxShape,
     Client,
@@ -115,7 +117,28 @@ def test_the_command_line_edits_files_and_scenes_of_a_service(service, demo_scen
     there = runner.invoke(app, ["scenes", "edit", "demo", "--into", "by-command", *short, *address, "--json"])
     assert there.exit_code == 0, there.output
     assert json.loads(there.output)["made_labels"] == ["tumour"]
-    assert runner.invoke(app, ["edit", "demo.ugr", "-o", "none.ugr"]).exit_code == 2
+
+
+def test_both_commands_and_the_answer_tell_what_an_edit_left_out(service, http, demo_scene, tmp_path):
+    breathing, still = tmp_path / "breathing.ugr", tmp_path / "demo.ugr"
+    demo_scene.save(still)
+    runner, scene = CliRunner(), add_motion(demo_scene, MotionSettings(chest_mm=4.0)).scene
+    scene.save(breathing)
+    raw = {"Content-Type": "application/octet-stream"}
+    assert http.put("/v1/scenes/breathing", content=breathing.read_bytes(), headers=raw).status_code == 201
+    cut = http.post("/v1/scenes/breathing:edit", json={"into": "breathing-cut", "edits": [CUT]}).json()
+    assert cut["motion"]["modes"][0]["name"] == "breathing"
+    here = runner.invoke(app, ["edit", str(breathing), "-o", str(tmp_path / "both.ugr"), "--merge", str(still)])
+    address = ["--address", service.http, "--api-key", KEY]
+    there = runner.invoke(app, ["scenes", "edit", "breathing", "--into", "both", "--merge", "demo", *address])
+    for result in (here, there):
+        assert result.output.endswith("; left out: modes of motion\n"), result.output
+    both = http.get("/v1/scenes/both").json()
+    assert (both["motion"], json.loads(both["edits"][0])["left_out"]) == (None, ["modes of motion"])
+
+
+def test_the_help_of_scenes_from_labels_names_the_tables_of_bodies():
+    assert "[[bodies]]" in " ".join(CliRunner().invoke(app, ["from-labels", "--help"]).output.split())
 
 
 def test_every_door_makes_scenes_from_labels(service, http, tmp_path, monkeypatch):
