@@ -134,7 +134,7 @@ def with_moved_modes(scene: GaussianScene, moving: Moving, by: FloatArray) -> Ga
         before = Displacement.on_grid(coefficients[None], motion.origin_mm, motion.spacing_mm)
 
         def field(points: Tensor, before: Displacement = before) -> Tensor:
-            return torch.cat([before.at((some - shift) @ turn)[0] @ turn.T for some in points.split(AT_ONCE)])
+            return torch.cat([before.at((some - shift) @ turn)[0] @ turn.T for some in torch.split(points, AT_ONCE)])
 
         scene, _ = with_mode(scene, mode, field, min(motion.spacing_mm))
     return scene
