@@ -1,16 +1,18 @@
 """The settings of a frame as ROS parameters: one for each field of RenderSettings, `display.` before those of Display.
 
-A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, [0.0] stands for no numbers. A
+A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, [nan] stands for no numbers. A
 probe is written by its name, such as `C5-2`, or as JSON, such as `{"kind": "convex", "opening_angle_deg": 60,
-"near_mm": 40, "far_mm": 95}`, and tools as a list of such objects.
+"near_mm": 40, "far_mm": 95}`, tools as a list of such objects, and breathing as `{"period_s": 4, "depth": 1}`.
 Free of ROS.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import operator
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from enum import Enum
 from types import NoneType
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
@@ -22,8 +24,9 @@ Value: TypeAlias = bool | int | float | str | list[str] | list[float]
 
 DISPLAY, PLAN = "display.", "plan."
 NEVER = "encoding"  # images are mono8
-NO_NUMBERS = [0.0]  # for an empty list of numbers: of one that is empty ROS cannot tell the type
-_LEFT_OPEN: dict[Any, Value] = {int: -1, float: -1.0}  # for what may be None; of all other kinds the empty text
+NO_NUMBERS = [math.nan]  # for an empty list of numbers: of one that is empty ROS cannot tell the type
+_NUMBERS = tuple[float, ...]
+_LEFT_OPEN: dict[Any, Value] = {int: -1, float: -1.0, _NUMBERS: NO_NUMBERS}  # for None; else the empty text
 
 
 def defaults() -> dict[str, Value]:
@@ -81,23 +84,24 @@ def _left_open(kind: Any) -> Value:
 
 
 def _read(name: str, kind: Any, value: Any) -> Any:
-    inner = [one for one in get_args(kind) if one is not NoneType] or [kind]
-    if NoneType in get_args(kind) and value == _left_open(kind):
+    is_optional = NoneType in get_args(kind)
+    inner = [one for one in get_args(kind) if one is not NoneType] if is_optional else [kind]
+    if is_optional and value == _left_open(kind):
         return None
     if name == "probe" and value in PROBES:
         return PROBES[value]
+    if inner[0] == _NUMBERS and all(map(math.isnan, value)):
+        return None if is_optional else ()
     if is_dataclass(inner[0]):
         return _member(name, inner, _document(name, inner, value))
-    if get_origin(inner[0]) is tuple and is_dataclass((kinds := get_args(get_args(inner[0])[0]))[0]):
+    if get_origin(inner[0]) is tuple and (kinds := get_args(get_args(inner[0])[0])):
         members = _document(name, kinds, value)
         if not isinstance(members, list):
             raise _not_json(name, kinds, value, "it is no list")
         return tuple(_member(name, kinds, one) for one in members)
     if isinstance(inner[0], type) and issubclass(inner[0], Enum):
         return _word(name, inner[0], value)
-    if get_origin(kind) is tuple:
-        return () if list(value) == NO_NUMBERS else tuple(value)
-    return value
+    return tuple(value) if get_origin(inner[0]) is tuple else value
 
 
 def _word(name: str, kind: type[Enum], value: Any) -> Enum:
@@ -116,31 +120,30 @@ def _document(name: str, kinds: Sequence[Any], text: str) -> Any:
 
 
 def _member(name: str, kinds: Sequence[Any], given: Any) -> Any:
-    """The object of a family that a JSON object stands for, told by its kind."""
+    """The object that a JSON object stands for: of the only class, or of the one of a family that its kind tells."""
     try:
         numbers = dict(given)
-        cls = {cls.kind: cls for cls in kinds}[numbers.pop("kind")]
-        hints = get_type_hints(cls).items()
-        words = {key: hint for key, hint in hints if isinstance(hint, type) and issubclass(hint, Enum)}
-        return cls(
-            **{
-                key: _word(f"{name}: {key}", words[key], value) if key in words else _frozen(value)
-                for key, value in numbers.items()
-            }
-        )
+        cls = kinds[0] if len(kinds) == 1 else {cls.kind: cls for cls in kinds}[numbers.pop("kind")]
+        hints = get_type_hints(cls)
+        found = cls(**numbers)
+        return replace(found, **{key: _entry(f"{name}: {key}", hints[key], one) for key, one in numbers.items()})
     except InvalidArgument:  # a word of it
         raise
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise _not_json(name, kinds, given, error) from None
 
 
-def _frozen(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+def _entry(name: str, kind: Any, value: Any) -> Any:
+    """A value of an object. Raises TypeError or ValueError for what is no number, InvalidArgument for a word."""
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return _word(name, kind, value)
+    if get_origin(kind) is tuple:
+        return tuple(map(float, value))
+    return operator.index(value) if kind is int else float(value)
 
 
 def _not_json(name: str, kinds: Sequence[Any], given: Any, error: object) -> InvalidArgument:
-    return InvalidArgument(
-        f"{name} must be JSON with a kind, one of {', '.join(cls.kind for cls in kinds)}, and its numbers, got "
-        f"{given!r:.200} ({error})",
-        field=name,
-    )
+    expected = ", ".join(item.name for item in fields(kinds[0]))
+    if len(kinds) > 1:
+        expected = f"a kind, one of {', '.join(cls.kind for cls in kinds)}, and its numbers"
+    return InvalidArgument(f"{name} must be JSON with {expected}, got {given!r:.200} ({error})", field=name)

@@ -1,12 +1,14 @@
 """Parameters of the node, and frames of the newest pose from a real service; without ROS."""
 
+import math
 import threading
+from array import array
 from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from ultragray_client import Below, Client, Contact, ConvexProbe, Display, Needle, RenderSettings, ToolFrame
+from ultragray_client import Below, Breathing, Client, Contact, ConvexProbe, Display, Needle, RenderSettings, ToolFrame
 from ultragray_client.errors import InvalidArgument
 from ultragray_ros.newest import NewestFrames, Problems
 from ultragray_ros.parameters import defaults, settings_of
@@ -43,6 +45,10 @@ def test_no_default_is_of_a_type_that_ros_lacks():
             {"display.gain_db": -1.0, "display.tgc_db": [0.0, 6.0]},
             RenderSettings(display=Display(gain_db=-1.0, tgc_db=(0.0, 6.0))),
         ),
+        ({"phase": array("d", [0.0])}, RenderSettings(phase=(0.0,))),  # rclpy gives arrays
+        ({"phase": array("d", [math.nan])}, RenderSettings()),
+        ({"breathing": '{"period_s": 3}'}, RenderSettings(breathing=Breathing(period_s=3.0))),
+        ({"contact": "pressure", "indentation_mm": 5.0}, RenderSettings(contact=Contact.PRESSURE, indentation_mm=5.0)),
         (
             {"probe": '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}'},
             RenderSettings(probe=ConvexProbe(60, 40, 95)),
@@ -68,6 +74,9 @@ def test_what_parameters_stand_for(given, expected):
         ({"contact": "firm"}, "contact must be one of air, pressure, got 'firm'"),
         ({"probe": "convex"}, "probe must be JSON with a kind"),
         ({"probe": '{"kind": "square"}'}, "one of convex, linear, phased, radial, steered, and its numbers"),
+        ({"probe": '{"kind": "phased", "opening_angle_deg": "wide", "far_mm": 9}'}, "could not convert"),
+        ({"breathing": "deep"}, "breathing must be JSON with period_s, depth, got 'deep'"),
+        ({"breathing": '{"depth_mm": 2}'}, "unexpected keyword argument 'depth_mm'"),
         ({"tools": "needle"}, "tools must be JSON with a kind, one of box, cylinder, needle"),
         ({"tools": '{"kind": "needle"}'}, "it is no list"),
         (

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
+from ultragray.learn.motion import add_motion
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray_client import Client, Display, PlanSettings, RenderSettings
 from ultragray_workers.datasets.store import open_datasets
 
@@ -168,6 +170,31 @@ def test_settings_are_parameters_which_the_service_checks(start_node, peer, ros_
     assert image.width > 40, "a fan, scan-converted"
     assert peer.set("outputs", ["bmode", "transmittance"]) is None
     assert peer.frame(peer.listen(Image, "transmittance"), 4).width == image.width
+
+
+def test_tissue_moves_by_parameters(start_node, peer, start_service, tmp_path, demo_scene):
+    from sensor_msgs.msg import Image
+
+    add_motion(demo_scene, MotionSettings(chest_mm=6.0)).scene.save(tmp_path / "demo.ugr")
+    service = start_service(data_folder=tmp_path)
+    start_node(address=service.grpc, phase="[1.0]")
+    images = peer.listen(Image, "bmode")
+    inhaled, at_rest = rendered(service, 0.0, RenderSettings(phase=(1.0,))), rendered(service, 0.0)
+    assert not np.array_equal(inhaled, at_rest)
+    np.testing.assert_array_equal(pixels(peer.frame(images, 1)), inhaled)
+    assert "one number for each mode (breathing), got 2" in (peer.set("phase", [0.0, 1.0]) or "")
+    assert "one chooses the other" in (peer.set("breathing", '{"period_s": 3}') or "")
+    assert peer.set("phase", [np.nan]) is None
+    np.testing.assert_array_equal(pixels(peer.frame(images, 2)), at_rest)
+    assert "breathing must be JSON with period_s, depth" in (peer.set("breathing", "deeply") or "")
+    assert peer.set("breathing", '{"period_s": 3}') is None
+    first = pixels(peer.frame(images, 3))
+    assert not np.array_equal(pixels(peer.frame(images, 4)), first)
+    assert peer.set("breathing", "") is None
+    assert "needs contact pressure" in (peer.set("indentation_mm", 3.0) or "")
+    assert peer.set("contact", "pressure") is None
+    assert peer.set("indentation_mm", 3.0) is None
+    assert not np.array_equal(pixels(peer.frame(images, 5)), at_rest)
 
 
 def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(start_node, peer, ros_service):
