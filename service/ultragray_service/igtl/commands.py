@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.etree import ElementTree
 
-from ultragray.contract import from_dict, shown, to_dict, under
+from ultragray.contract import Contract, from_dict, shown, to_dict, under
 from ultragray.errors import InvalidArgument, InvalidProbe, UltragrayError
 from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray, Probe
@@ -17,6 +17,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB
 from ultragray.rendering.settings import FrameSettings
 from ultragray.rendering.tools import MAX_TOOLS, Tool
+from ultragray.scene.modes import Breathing
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, Message, pack_text, unpack_text
@@ -237,11 +238,13 @@ def _document(one: ClientTool) -> dict[str, Any]:
 
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0
-_SCENE, _PROBE, _REGISTRATION, _TOOLS, _PREDICT = "Scene", "Probe", "Registration", "Tools", "PredictMs"
+_SCENE, _REGISTRATION, _TOOLS, _PREDICT = "Scene", "Registration", "Tools", "PredictMs"
 
 
 @dataclass(frozen=True)
-class _DisplayParameter:
+class _Parameter:
+    """A field of the settings, and its text."""
+
     field: str
     read: Callable[[str], Any]
     write: Callable[[Any], str]
@@ -271,17 +274,51 @@ def _number_text(number: float) -> str:
     return f"{number:.10g}"
 
 
-_DISPLAY: Mapping[str, _DisplayParameter] = {
-    "DepthMm": _DisplayParameter("depth_mm", _number, _number_text),
-    "GainPercent": _DisplayParameter(
-        "gain_db", _gain_db, lambda db: _number_text(_NO_GAIN_PERCENT + db / _DB_A_PERCENT)
-    ),
-    "DynRangeDb": _DisplayParameter("dynamic_range_db", _number, _number_text),
-    "TimeGainCompensation": _DisplayParameter(
-        "tgc_db", lambda text: tuple(map(_number, text.split())), lambda gains: " ".join(map(_number_text, gains))
-    ),
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(map(_number, text.split()))
+
+
+def _numbers_text(numbers: Sequence[float]) -> str:
+    return " ".join(map(_number_text, numbers))
+
+
+def _probe(text: str) -> Probe:
+    try:
+        document = to_dict(Probe.named[text]) if text in Probe.named else json.loads(text)
+    except (ValueError, RecursionError):
+        names = ", ".join(Probe.named)
+        raise InvalidProbe(
+            f'must be one of {names}, or JSON such as {{"kind": "linear", …}}, got {shown(text)}'
+        ) from None
+    return from_dict(Probe, document)
+
+
+def _breathing(text: str) -> Breathing:
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        raise InvalidArgument(f"must be JSON such as {_json(Breathing())}, got {shown(text)}") from None
+    return from_dict(Breathing, document)
+
+
+def _json(value: Contract) -> str:
+    return json.dumps(to_dict(value, with_none=False))
+
+
+_DISPLAY: Mapping[str, _Parameter] = {
+    "DepthMm": _Parameter("depth_mm", _number, _number_text),
+    "GainPercent": _Parameter("gain_db", _gain_db, lambda db: _number_text(_NO_GAIN_PERCENT + db / _DB_A_PERCENT)),
+    "DynRangeDb": _Parameter("dynamic_range_db", _number, _number_text),
+    "TimeGainCompensation": _Parameter("tgc_db", _numbers, _numbers_text),
 }
-PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _PREDICT, _TOOLS)
+_FRAMES: Mapping[str, _Parameter] = {  # none: ""
+    "Probe": _Parameter("probe", _probe, _json),
+    "Phase": _Parameter("phase", _numbers, _numbers_text),
+    "Breathing": _Parameter("breathing", _breathing, _json),
+    "Contact": _Parameter("contact", str, lambda contact: contact.value),
+    "IndentationMm": _Parameter("indentation_mm", _number, _number_text),
+}
+PARAMETERS = (*_DISPLAY, _SCENE, *_FRAMES, _REGISTRATION, _PREDICT, _TOOLS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,8 +364,8 @@ class Scanner:
         elif parameter == _PREDICT:
             self._paths.clear()
             self.setup = replace(self.setup, predict_ms=_predict_ms(value) if value else None)
-        elif parameter == _PROBE:
-            self._set(probe=_probe(value))
+        elif (of_frames := _FRAMES.get(parameter)) is not None:
+            self._set(**{of_frames.field: of_frames.read(value) if value else None})
         else:
             of_display = _of_display(parameter)
             display = self.setup.settings.display or AS_RENDERED
@@ -347,33 +384,20 @@ class Scanner:
             return json.dumps([_document(one) for one in self.setup.tools.tools])
         if parameter == _PREDICT:
             return "" if self.setup.predict_ms is None else _number_text(self.setup.predict_ms)
-        if parameter == _PROBE:
-            probe = self.setup.settings.probe
-            text = None if probe is None else json.dumps(to_dict(probe, with_none=False))
-        else:
-            of_display = _of_display(parameter)
-            value = getattr(self.setup.settings.display or AS_RENDERED, of_display.field)
-            text = None if value is None else of_display.write(value)
-        if text is None:
+        if (of_frames := _FRAMES.get(parameter)) is not None:
+            value = getattr(self.setup.settings, of_frames.field)
+            return "" if value is None else of_frames.write(value)
+        of_display = _of_display(parameter)
+        value = getattr(self.setup.settings.display or AS_RENDERED, of_display.field)
+        if value is None:
             raise InvalidArgument("is not set: frames have that of their scene")
-        return text
+        return of_display.write(value)
 
 
-def _of_display(parameter: str) -> _DisplayParameter:
+def _of_display(parameter: str) -> _Parameter:
     if parameter not in _DISPLAY:
         raise InvalidArgument(f"must be one of {', '.join(PARAMETERS)}, got {shown(parameter)}")
     return _DISPLAY[parameter]
-
-
-def _probe(text: str) -> Probe:
-    try:
-        document = to_dict(Probe.named[text]) if text in Probe.named else json.loads(text)
-    except (ValueError, RecursionError):
-        names = ", ".join(Probe.named)
-        raise InvalidProbe(
-            f'must be one of {names}, or JSON such as {{"kind": "linear", …}}, got {shown(text)}'
-        ) from None
-    return from_dict(Probe, document)
 
 
 _ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply

@@ -9,6 +9,8 @@ import pyigtl
 import pytest
 
 from ultragray import ConvexProbe, GaussianScene
+from ultragray.learn.motion import add_motion
+from ultragray.scene.motion_settings import MotionSettings
 from ultragray_service.igtl.contents import pack_transform, unpack_image, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
 
@@ -74,7 +76,7 @@ class Peer:
 
 @pytest.fixture(scope="session")
 def igtl_folder(data_folder, tmp_path_factory):
-    """Linear scenes (images of `medium` are 128x128, of `large` 512x512), and `fan` of a convex probe."""
+    """Linear scenes (images of `medium` are 128x128, of `large` 512x512), `fan` of a convex probe, and `breathing`."""
     folder = tmp_path_factory.mktemp("igtl")
     for name in ("demo", "second"):
         (folder / f"{name}.ugr").write_bytes((data_folder / f"{name}.ugr").read_bytes())
@@ -83,6 +85,7 @@ def igtl_folder(data_folder, tmp_path_factory):
         info = replace(demo.info, image_height=side, image_width=side)
         GaussianScene.from_splats(demo.splats, info=info).save(folder / f"{name}.ugr")
     make_scene(seed=2, probe=FAN).save(folder / "fan.ugr")
+    add_motion(demo, MotionSettings(chest_mm=6.0)).scene.save(folder / "breathing.ugr")
     return folder
 
 

@@ -123,6 +123,10 @@ def test_every_parameter_is_told_as_it_was_set(peer):
         "TimeGainCompensation": "-1 0 2.5 4",
         "Scene": "second",
         "Probe": '{"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}',
+        "Phase": "0.5 -1",
+        "Breathing": '{"period_s": 3.0, "depth": 0.5}',
+        "Contact": "pressure",
+        "IndentationMm": "2.5",
         "Registration": "",
         "PredictMs": "80",
         "Tools": "[]",
@@ -132,6 +136,28 @@ def test_every_parameter_is_told_as_it_was_set(peer):
     assert {name: value_of(peer, name) for name in values} == values
     set_to(peer, Probe="L12-4")
     assert from_dict(Probe, json.loads(value_of(peer, "Probe"))) == Probe.named["L12-4"]
+    unset = dict.fromkeys(("Probe", "Phase", "Breathing", "IndentationMm", "Contact"), "")
+    set_to(peer, **unset)
+    assert {name: value_of(peer, name) for name in unset} == unset
+
+
+def test_tissue_breathes_and_is_pressed(peer):
+    def metadata():
+        peer.send_pose(np.eye(4), "breathing", version=2)
+        return peer.receive().metadata
+
+    set_to(peer, Phase="0.5")
+    assert metadata()["phase"] == "[0.5]"
+    set_to(peer, Breathing="{}")
+    peer.send_pose(np.eye(4), "breathing")
+    assert "phase and breathing are given" in peer.status().text
+    set_to(peer, Phase="")
+    assert metadata()["phase"] != metadata()["phase"]
+    set_to(peer, Breathing="", Contact="pressure", IndentationMm="2.5")
+    pressed = metadata()
+    assert (pressed["contact"], pressed["indentation_mm"]) == ("pressure", "2.500")
+    assert float(pressed["force_n"]) > 0.0
+    assert "phase" not in pressed
 
 
 def test_settings_are_those_of_one_connection(connect):
@@ -153,6 +179,11 @@ def test_settings_are_those_of_one_connection(connect):
         ("DepthMm", "deep", "must be a number, got 'deep'"),
         ("GainPercent", "101", "from 0 to 100, got '101'"),
         ("Probe", '{"kind": "linear", "width_mm": -1}', "near_mm is required"),
+        ("Phase", "0.5,1", "must be a number, got '0.5,1'"),
+        ("Breathing", "deep", """must be JSON such as {"period_s": 4.0, "depth": 1.0}, got 'deep'"""),
+        ("Breathing", '{"period_s": 0}', "period_s must be a finite number from 0.2 to 60, got 0"),
+        ("Contact", "firm", "contact must be one of air, pressure, got 'firm'"),
+        ("IndentationMm", "2", "indentation_mm needs contact pressure"),
         ("FrequencyMhz", "5", f"must be one of {', '.join(PARAMETERS)}, got 'FrequencyMhz'"),
     ],
 )
