@@ -201,8 +201,17 @@ function readProbe(kind: string, kept: Kept): Probe {
 
 function readField(field: Described, text: string): unknown {
   if (field.type === "boolean") return oneOf(["true", "false"], text) === "true";
+  if (field.type === "object") return objectOf(field, text);
   if (field.type === "array") return text.split(BETWEEN).map((one) => numberWithin(field.items!, one));
   return field.enum ? oneOf(field.enum, text) : numberWithin(field, text);
+}
+
+/** An object whose fields are numbers, in their order. */
+function objectOf(field: Described, text: string): Record<string, number> {
+  const fields = fieldsOf(field);
+  const numbers = numbersIn(text, fields.length);
+  if (numbers === null) throw new Error(words.session.link.count(fields.length));
+  return Object.fromEntries(fields.map(([name, one], index) => [name, numberWithin(one, String(numbers[index]))]));
 }
 
 function numberWithin({ minimum = -Infinity, maximum = Infinity }: Described, text: string): number {
@@ -219,5 +228,5 @@ function oneOf<T extends string>(choices: readonly T[], text: string): T {
 }
 
 function written(value: unknown): string {
-  return Array.isArray(value) ? value.join(BETWEEN) : String(value);
+  return typeof value === "object" && value !== null ? Object.values(value).join(BETWEEN) : String(value);
 }
