@@ -162,6 +162,23 @@ for (const [fault, code] of Object.entries(FAULTS))
     await page.close();
   });
 
+test("a browser that never answers about its GPU has its frames drawn without it", async () => {
+  cpSync(site.folder, `${site.folder}-no-answer`, { recursive: true });
+  const silent = `Object.defineProperty(navigator, "gpu", { value: { requestAdapter: () => (new BroadcastChannel("asked").postMessage(0), new Promise(() => undefined)) } });`;
+  appendFileSync(path.join(`${site.folder}-no-answer`, "gpu/renderer.js"), silent);
+  renameSync(`${site.folder}-no-answer`, path.join(site.folder, "no-answer"));
+  const page = await browser.newPage();
+  await page.goto(`${url}page.json`);
+  const found = await page.evaluate(async (folder) => {
+    const asked = new Promise((resolve) => (new BroadcastChannel("asked").onmessage = () => resolve(true)));
+    const { Scene } = await import(`${folder}/index.js`);
+    const scene = await Scene.load("demo.ugr");
+    return [scene.renderer, await asked];
+  }, `${url}no-answer`);
+  assert.deepEqual(found, ["wasm", true]);
+  await page.close();
+});
+
 test("the page goes on without a network, is steered by keys, and keeps its policy", async () => {
   const context = await browser.newContext();
   const page = await context.newPage();

@@ -10,6 +10,7 @@ const SLICE_BYTES = 40;
 const EXTENT_BYTES = 28;
 const BOUNDS_BYTES = 20;
 const FINISH_COLUMNS = 64;
+const MOST_WAIT_MS = 3000; // for word of the GPU
 const FAR = 1e30; // in place of what is infinite: WGSL need not know that
 
 /** The passes of frames of one view, and what they draw into. */
@@ -38,7 +39,7 @@ export class GpuRenderer {
 
   /** Of a scene that the library holds. Throws, in a sentence, where no adapter suffices; one in software does only if asked. */
   static async open(library: Library, scene: number, { software }: { software: boolean }): Promise<GpuRenderer> {
-    const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
+    const adapter = await answered(navigator.gpu?.requestAdapter({ powerPreference: "high-performance" }));
     if (!adapter) throw new Error("there is no WebGPU adapter");
     if (adapter.info.isFallbackAdapter && !software) throw new Error("the WebGPU adapter is software, which is slower than WebAssembly");
     const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
@@ -168,6 +169,17 @@ export class GpuRenderer {
       if (error) throw new Error(`the memory of the GPU does not suffice: ${error.message}`);
     }
     return made;
+  }
+}
+
+/** What the browser answers about its GPU; undefined where it does not, as one whose process for graphics hangs. */
+async function answered<Answer>(answer: Promise<Answer> | undefined): Promise<Answer | undefined> {
+  let timer;
+  const late = new Promise<undefined>((resolve) => (timer = setTimeout(resolve, MOST_WAIT_MS)));
+  try {
+    return await Promise.race([answer, late]);
+  } finally {
+    clearTimeout(timer);
   }
 }
 
