@@ -10,7 +10,6 @@ from ultragray import GaussianScene, LinearProbe, phantom, render
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.registration import load_registration
-from ultragray.learn.training import train
 from ultragray.learn.training.agreement import agreed_path, with_shares
 from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import png_file
@@ -18,7 +17,6 @@ from ultragray.scene.info import read_header
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
-from ...model.learn.conftest import make_tiny_config
 from ...model.learn.training.test_agreement import FRAMES, PROBE, hand_path, recording
 from ...model.test_registration import motion
 from ...workers.jobs.conftest import store_dataset
@@ -190,8 +188,11 @@ def test_poses_that_a_scene_of_following_tissue_was_trained_on_can_be_had(tmp_pa
     given, sweep = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0,) * 3), tracked), tmp_path / "sweep"
     write_released(given, sweep)
     given = load_dataset(sweep)
-    scene, path = train(given, make_tiny_config(steps=1, refine_poses="path")), agreed_path(given)
-    scene.save(tmp_path / "scene.ugr")
+    settings = ("--steps", "1", "--max-gaussians", "60", "--no-confidence")
+    told = succeeded("train", sweep, "-o", tmp_path / "scene.ugr", *settings).output
+    assert "held out, on the path" in told
+    assert "poses of 30 training frames were corrected by" in told
+    scene, path = GaussianScene.load(tmp_path / "scene.ugr"), agreed_path(given)
     succeeded("convert", sweep, "--poses-of", tmp_path / "scene.ugr", "-o", tmp_path / "corrected")
     corrected = load_dataset(tmp_path / "corrected")
     for found, expected in ((corrected.train, scene.rest_poses), (corrected.val, path.val)):
