@@ -108,7 +108,7 @@ def timed(locate: Callable[[], Localization]) -> tuple[Localization, float, floa
 
 def trained(dataset: Dataset, true: FloatArray | None = None) -> HeldOut:  # [V, 4, 4] mm
     scene = train_and_evaluate(dataset, TrainingConfig.preset("fast", confidence=False)).scene
-    placed = held_out_on_path(dataset, scene.info)
+    placed = held_out_on_path(dataset, scene)
     chosen = np.unique(np.linspace(0, len(dataset.val) - 1, MOST_FRAMES).round().astype(int))
     on_path = None if placed is None else placed.poses[chosen]
     return HeldOut(scene, dataset.val.select(chosen), on_path, None if true is None else true[chosen])

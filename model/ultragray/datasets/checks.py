@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.contract import made_of
+from ultragray.datasets.causes import PathReport
 from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay, goes_to_and_fro_mm
 from ultragray.datasets.images import CropBox
 from ultragray.geometry.probe import Fan, FloatArray, Probe
@@ -85,7 +86,6 @@ SMALLEST_TURN_DEG = 20.0
 SATURATED_SHARE = 0.05
 DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
-SHAKEN_DB = 1.0  # by which frames must be predicted better in time than in space
 SHORTEST_TRAVEL = 0.1  # of the length of the scan lines
 TURN_IN_PLACE_DEG = 5.0
 LONGEST_USUAL_STEP_MM = 50.0
@@ -137,6 +137,7 @@ class DatasetReport:
     val_angle_max_deg: float | None  # to that nearest frame
     chain: Chain  # from pixels to the frame of the poses
     image_delay_ms: float | None  # of the images to the poses, as path and pictures tell it
+    path: PathReport | None  # what neighbouring frames tell of their poses; None: no three frames in a row
     warnings: tuple[str, ...]  # all of them, those of one part with its name
 
 
@@ -162,6 +163,8 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
             f"path and pictures fit so ({delay.unexplained:.0%} unexplained, {delay.without:.0%} without): "
             f"--image-delay-ms {delay.delay_ms:.0f} corrects it"
         )
+    found_path = agreed_path(dataset)
+    path = None if found_path is None else PathReport.of(found_path, dataset.probe)
     return DatasetReport(
         name=dataset.name,
         sha256=dataset.sha256,
@@ -173,7 +176,8 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
         val_angle_max_deg=float(angles.max()) if len(angles) else None,
         chain=train.chain,
         image_delay_ms=None if delay is None else delay.delay_ms,
-        warnings=(*found, *_dataset_warnings(dataset)),
+        path=path,
+        warnings=(*found, *_dataset_warnings(dataset, path)),
     )
 
 
@@ -446,56 +450,17 @@ def _stands_out(mark: np.ndarray, marks: np.ndarray, low: np.ndarray) -> bool:
     return not around.any() or float(low[mark].mean()) >= MARK_CONTRAST * float(np.median(low[around]))
 
 
-def _dataset_warnings(dataset: Dataset) -> list[str]:
+def _dataset_warnings(dataset: Dataset, path: PathReport | None) -> list[str]:
     found = [
         *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
         *(list(dataset.probe.oddities()) or _hardly_moved(dataset.train)),
-        *_shaken(dataset),
+        *(() if path is None else path.warnings),
     ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
     if leaked:
         listed = frame_list(dataset.val.frame_numbers[leaked])
         found.append(f"held-out frames {listed} are also training frames: metrics will flatter")
-    return found
-
-
-def _shaken(dataset: Dataset) -> list[str]:
-    """Poses that are of another time, calibrated wrongly, or predict a frame worse than its neighbours in time do."""
-    path = agreed_path(dataset)
-    if path is None:
-        return []
-    found = []
-    if path.delay_s:
-        found.append(
-            f"images seem to be {1000.0 * path.delay_s:.0f} ms later than their poses: with poses of that time before, "
-            "neighbouring frames predict each other best (a training takes it off, image_delay_ms as well)"
-        )
-    if not np.array_equal(path.calibration, np.eye(4)):
-        middle = np.append(dataset.probe.corners_mm().mean(axis=0), 1.0)
-        shift_mm = float(np.linalg.norm(path.calibration @ middle - middle))
-        turn_deg = float(rotation_angles_deg(path.calibration[None], np.eye(4)[None])[0, 0])
-        found.append(
-            f"the calibration from the image to the probe seems to be off by {shift_mm:.1f} mm in the middle of the "
-            f"image and {turn_deg:.1f}°: with another one, which a training takes, sweeps that cross agree better"
-        )
-    if (crossing := path.crossing) is not None:
-        found.append(
-            "passes that cross do not fit: what one shows and another predicts has a correlation of "
-            f"{crossing.before:.2f}; the tracker wanders, or tissue was pressed (a training moves frames smoothly, by "
-            f"{crossing.shift_mm:.1f} mm root mean square, and has {crossing.after:.2f})"
-        )
-    if path.in_time_db < path.tracked_db + SHAKEN_DB:
-        return found
-    noise, gain_db = path.noise, path.found_db - path.tracked_db
-    remedy = f"; a training corrects {gain_db:.1f} dB of it" if gain_db else ""
-    lateral_mm, elevation_mm, axial_mm = noise.axes_mm
-    found.append(
-        f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
-        f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it; "
-        f"laterally {lateral_mm:.2f}, axially {axial_mm:.2f}, in elevation at most {elevation_mm:.2f} mm), or tissue "
-        f"moves with the probe{remedy}"
-    )
     return found
 
 

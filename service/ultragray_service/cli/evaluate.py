@@ -94,8 +94,7 @@ def evaluate(
     with working(f"measuring {len(frames)} frames …"):
         evaluation = evaluate_scene(loaded, frames, backend=backend)
         reliability = measure_reliability(loaded, frames, backend=backend)
-        corrections = loaded.pose_corrections
-        sizes = None if corrections is None else CorrectionSizes.of(corrections, loaded.training_poses)
+        sizes = CorrectionSizes.of(loaded)
         held_out = None
         if split is Split.VAL:
             held_out = score_held_out(loaded, read, evaluation, register=register, backend=backend)

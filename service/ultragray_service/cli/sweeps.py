@@ -11,7 +11,7 @@ import typer
 from ultragray.contract import to_dict
 from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, format_of, load_dataset
 from ultragray.errors import InvalidArgument
-from ultragray.scene.info import SceneHeader, read_header
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     Force,
@@ -176,7 +176,7 @@ def convert(
     json: Json = False,
     poses_of: Annotated[
         Path | None,
-        option("A scene trained from it: its corrected training poses are written.", metavar="SCENE", shown=False),
+        option("A scene trained from it: the poses that it was trained on are written.", metavar="SCENE", shown=False),
     ] = None,
     anonymize: Annotated[
         bool,
@@ -189,10 +189,11 @@ def convert(
     from ultragray.datasets.released import write_released
 
     check_folder(output, force=force)
-    header = None if poses_of is None else read_header(poses_of)
+    if poses_of is not None:
+        read_header(poses_of)
     read = read_dataset(sweep, source)
-    if header is not None:
-        read = _with_poses_of(poses_of, header, read)
+    if poses_of is not None:
+        read = _with_poses_of(poses_of, read)
     marks = 0
     if anonymize:
         from ultragray.datasets.checks import without_names
@@ -216,11 +217,19 @@ def convert(
     )
 
 
-def _with_poses_of(path: Path | None, header: SceneHeader, dataset: Dataset) -> Dataset:
-    if header.info.dataset_sha256 != dataset.sha256:
+def _with_poses_of(path: Path, dataset: Dataset) -> Dataset:
+    """The dataset with the poses that a scene was trained on; held-out frames are moved likewise."""
+    from ultragray.learn.training.poses import held_out_on_path
+    from ultragray.scene.gaussians import GaussianScene
+
+    scene = GaussianScene.load(path)
+    if scene.info.dataset_sha256 != dataset.sha256:
         raise InvalidArgument(
-            f"{path} was trained from {header.info.dataset_name or 'other data'}, not from {dataset.name} split as "
+            f"{path} was trained from {scene.info.dataset_name or 'other data'}, not from {dataset.name} split as "
             "here: give the sweep and the options that it was trained with",
             field="poses_of",
         )
-    return replace(dataset, train=replace(dataset.train, poses=header.training_poses))
+    held_out = held_out_on_path(dataset, scene)
+    if held_out is None:
+        held_out = replace(dataset.val, poses=scene.poses_at_rest(dataset.val.poses))
+    return replace(dataset, train=replace(dataset.train, poses=scene.at_rest().training_poses), val=held_out)

@@ -294,9 +294,15 @@ def _print_metrics(scene: GaussianScene) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from ultragray.learn.report.sizes import CorrectionSizes
+
     metrics = scene.info.metrics
     if not metrics:
         return
-    table = Table("held out", *(METRIC_NAMES[name] for name in metrics))
+    moved = CorrectionSizes.of(scene)
+    is_on_path = moved is not None and scene.info.training["refine_poses"] == "path"
+    table = Table("held out, on the path" if is_on_path else "held out", *(METRIC_NAMES[name] for name in metrics))
     table.add_row("mean", *(f"{value:.2f}" if name == "psnr_db" else f"{value:.3f}" for name, value in metrics.items()))
     Console().print(table)
+    if moved is not None:
+        typer.echo(str(moved))

@@ -38,7 +38,7 @@ class Compounding(Method):
         size = "0.5 mm" if self.voxel_mm is None else f"{self.voxel_mm:g} mm"
         return Description(
             title=f"{self.fold} compounding, {size}",
-            source="Gobbi and Peters, 2002; docs/concepts/baselines.md",
+            source="Gobbi and Peters, 2002; ultragray.learn.evaluation.baselines",
             summary=f"Each voxel of {size} keeps the {self.fold} of the pixels that fall into it; gaps are filled.",
             choices=() if self.voxel_mm else ("Voxels are larger where 0.5 mm would not fit into memory.",),
         )
@@ -75,7 +75,7 @@ class FromFrames(Method):
             "linear": "Each pixel from the nearest frame on either side of it, by the distances to their planes.",
             "nearest": "The training frame whose corners lie nearest on average, as it is.",
         }
-        return Description(titles[self.name], "docs/concepts/baselines.md", summaries[self.name])
+        return Description(titles[self.name], "ultragray.learn.evaluation.baselines", summaries[self.name])
 
     def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> _Frames:
         return _Frames(dataset.train, self.name, Cost(0.0, 0, None, dataset.train.images.nbytes))
@@ -107,7 +107,7 @@ class InTime(Method):
     def describe(self) -> Description:
         return Description(
             "neighbours in time",
-            "docs/concepts/baselines.md",
+            "ultragray.learn.evaluation.baselines",
             "Each pixel from the same pixel of the training frames before and after it in its recording, by their "
             "times: what poses are worth shows beside it.",
             choices=("At an end of the recording the one neighbour.", "It has frames of its own recording only."),

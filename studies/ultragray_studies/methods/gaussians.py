@@ -96,7 +96,7 @@ class SceneMethod(Method):
 
     def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray | None:
         assert isinstance(fitted, SceneFit)
-        held_out = held_out_on_path(dataset, fitted.scene.info)
+        held_out = held_out_on_path(dataset, fitted.scene)
         return None if held_out is None else fitted.predict(held_out)
 
     def _fitted(self, scene: GaussianScene, folder: Path, device: str) -> SceneFit:

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, phantom, render
+from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.registration import load_registration
+from ultragray.learn.training.agreement import agreed_path, with_shares
 from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import png_file
 from ultragray.scene.info import read_header
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
+from ...model.learn.training.test_agreement import FRAMES, PROBE, hand_path, recording
 from ...model.test_registration import motion
 from ...workers.jobs.conftest import store_dataset
 from .command_line import noise_sweep, refused, run, succeeded
@@ -178,6 +181,26 @@ def test_convert_writes_what_is_read_back(folder):
     assert "new or empty folder" in refused("convert", folder, "-o", folder.parent / "half")
     succeeded("convert", folder, "-o", folder.parent / "half", "--force")
     assert load_dataset(folder.parent / "half").sha256 == load_dataset(folder).sha256
+
+
+def test_poses_that_a_scene_of_following_tissue_was_trained_on_can_be_had(tmp_path):
+    tracked = hand_path()
+    given, sweep = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0,) * 3), tracked), tmp_path / "sweep"
+    write_released(given, sweep)
+    given = load_dataset(sweep)
+    settings = ("--steps", "1", "--max-gaussians", "60", "--no-confidence")
+    told = succeeded("train", sweep, "-o", tmp_path / "scene.ugr", *settings).output
+    assert "held out, on the path" in told
+    assert "poses of 30 training frames were corrected by" in told
+    scene, path = GaussianScene.load(tmp_path / "scene.ugr"), agreed_path(given)
+    succeeded("convert", sweep, "--poses-of", tmp_path / "scene.ugr", "-o", tmp_path / "corrected")
+    corrected = load_dataset(tmp_path / "corrected")
+    for found, expected in ((corrected.train, scene.rest_poses), (corrected.val, path.val)):
+        np.testing.assert_allclose(found.poses, expected, atol=1e-4)
+    figures = json.loads(run("eval", tmp_path / "scene.ugr", sweep, "--json").stdout)
+    moved_mm = np.linalg.norm((scene.rest_poses - given.train.poses)[:, :3, 3], axis=1)
+    np.testing.assert_allclose(figures["pose_corrections"]["shift_mm"], moved_mm, atol=1e-3)
+    assert moved_mm.max() > 0.5
 
 
 def test_draw_draws_a_png(folder):

@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import json
 import socket
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -89,7 +90,7 @@ def test_an_even_selection(count, limit):
 def test_training_poses(http, demo_scene):
     told = http.get("/v1/scenes/demo/training-poses").json()
     np.testing.assert_array_equal(np.array(told["poses"]).reshape(-1, 4, 4), demo_scene.training_poses)
-    assert told["shift_mm"] is told["turn_deg"] is None
+    assert told["rest_poses"] is told["shift_mm"] is told["turn_deg"] is None
 
 
 def test_the_life_of_an_imported_scene(http, artifacts):
@@ -237,6 +238,20 @@ def test_corrected_training_poses(http):
     told = http.get("/v1/scenes/corrected/training-poses").json()
     assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
     http.delete("/v1/scenes/corrected")
+
+
+def test_poses_in_the_tissue_at_rest_are_told_beside_those_of_the_tracker(http):
+    plain = make_scene(probe=DEMO_PROBE, seed=6)
+    tracked, at_rest = np.tile(np.eye(4), (2, 2, 1, 1))
+    at_rest[1, 2, 3] = 3.0
+    info = replace(plain.info, tissue_shares=(0.5, 0.5, 0.5))
+    scene = GaussianScene.from_splats(plain.splats, info=info, training_poses=tracked, rest_poses=at_rest)
+    assert http.put("/v1/scenes/at_rest", content=scene.to_bytes(), headers=RAW).status_code == 201
+    told = http.get("/v1/scenes/at_rest/training-poses").json()
+    for name, poses in (("poses", tracked), ("rest_poses", at_rest)):
+        np.testing.assert_array_equal(np.array(told[name]).reshape(-1, 4, 4), poses)
+    assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 3.0], [0.0, 0.0])
+    http.delete("/v1/scenes/at_rest")
 
 
 async def sent(response):

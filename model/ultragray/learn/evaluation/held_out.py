@@ -84,7 +84,7 @@ def score_held_out(
 
     Raises as `evaluate` and `register_halves` do.
     """
-    placed = held_out_on_path(dataset, scene.info)
+    placed = held_out_on_path(dataset, scene)
     at_rest = scene.at_rest()
     on_path = None if placed is None else evaluate(at_rest, placed, backend=backend)
     start = replace(dataset.val, poses=scene.poses_at_rest(dataset.val.poses)) if placed is None else placed

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import turn_angles_rad
+
+if TYPE_CHECKING:
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.scene.info import SceneHeader
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +23,15 @@ class CorrectionSizes:
     turn_deg: FloatArray  # [P]
 
     @classmethod
-    def of(cls, corrections: FloatArray, training_poses: FloatArray) -> CorrectionSizes:  # [P, 4, 4] both
-        """Of corrections that were left-multiplied to the tracker's poses, which gave the training poses."""
-        given = np.linalg.inv(corrections) @ training_poses
-        shifts = np.linalg.norm(training_poses[:, :3, 3] - given[:, :3, 3], axis=1)
-        return cls(shifts, np.degrees(turn_angles_rad(corrections[:, :3, :3], np.eye(3))))
+    def of(cls, scene: SceneHeader | GaussianScene) -> CorrectionSizes | None:
+        """From the tracker's poses to those that the scene was trained on; None where these are the same."""
+        tracked, corrections, rest = scene.training_poses, scene.pose_corrections, scene.rest_poses
+        if corrections is None and rest is None:
+            return None
+        told = tracked if corrections is None else np.linalg.inv(corrections) @ tracked
+        trained = tracked if rest is None else rest
+        shifts = np.linalg.norm(trained[:, :3, 3] - told[:, :3, 3], axis=1)
+        return cls(shifts, np.degrees(turn_angles_rad(trained[:, :3, :3], told[:, :3, :3])))
 
     def to_dict(self) -> dict[str, Any]:
         return {"shift_mm": self.shift_mm.tolist(), "turn_deg": self.turn_deg.tolist()}

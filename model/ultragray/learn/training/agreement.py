@@ -6,7 +6,7 @@ frame is predicted from two about it in its sweep, in space, and of these paths 
 
 - as tracked;
 - without the tracker's noise (`alignment.without_noise`);
-- that, a delay of the images earlier (`delay`), where their times are known;
+- that, a delay of the images earlier (`delay`), where their times are known, if all that follows predicts better so;
 - that, with another calibration from the image to the probe, where sweeps cross (`alignment.found_calibration`);
 - that, but of the motion within the image plane only a share: of the shifts along the lateral and the axial axis, and
   of the turn about the elevation axis. 1: tissue is rigid; 0: it stays where it is in the image, and the frames are a
@@ -15,9 +15,10 @@ frame is predicted from two about it in its sweep, in space, and of these paths 
   seems to hasten and to halt from one frame to the next, which is no white noise;
 - that, with a smooth motion of each pass by which passes agree where they cross (`crossing`).
 
-Another path than the tracked one has to predict better, by LEAST_GAIN_DB, GAIN_OF_SHARES_DB or GAIN_OF_EVENNESS_DB; the
-last of them, which other passes speak for, may predict neighbours worse by LOSS_OF_CROSSING_DB. Of motion across the
-plane the images of one sweep say little: there the smoothness of the path is most of the evidence.
+Another path than the tracked one has to predict better, by LEAST_GAIN_DB, GAIN_OF_DELAY_DB, GAIN_OF_SHARES_DB or
+GAIN_OF_EVENNESS_DB; the last of them, which other passes speak for, may predict neighbours worse by
+LOSS_OF_CROSSING_DB. Of motion across the plane the images of one sweep say little: there the smoothness of the path is
+most of the evidence.
 Free of torch, since data sets are checked without it.
 """
 
@@ -25,8 +26,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import TypeAlias
+from functools import cache, partial
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -48,13 +49,15 @@ from ultragray.learn.training.delay import found_delay_s, with_delay
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
 LEAST_GAIN_DB = 0.05  # of a path without noise
+GAIN_OF_DELAY_DB = 0.03  # at the end of the path: shares and calibration may have explained it better
+LEAST_DELAYED = 16  # frames that are predicted: of fewer, a real hand told any delay from -400 to 130 ms
 EVEN_FRAMES = 4.0  # standard deviation of the Gaussian that evens out the steps from frame to frame
 GAIN_OF_EVENNESS_DB = 0.03  # where poses are exact, it loses
 LOSS_OF_CROSSING_DB = 0.1  # within the passes, for their agreement
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
 FAR = 4  # frames away from the one that is predicted
-LEAST_PREDICTED = 8  # frames: fewer may fit any shares by chance
+LEAST_PREDICTED = 8  # frames: fewer may fit any shares, and an even path, by chance
 CROSSING_FRAMES, CROSSING_PIXELS = 48, 512  # that are looked at in other passes, of each
 CROSSING_MM = 1.0  # of a pixel from a frame of another pass: it shows the same
 LEAST_CROSSING = 1000  # pixels that other passes show: fewer say little
@@ -74,11 +77,13 @@ class AgreedPath:
     tracked: FloatArray  # [F, 4, 4] of the training frames in the tracker's frame, without its noise and the delay
     in_time_db: float  # pixel by pixel, whatever the poses say
     tracked_db: float  # in space, as tracked
-    found_db: float  # in space, on this path
-    shares: Shares  # of the motion within the plane that it has
     noise: TrackerNoise  # of the tracker
+    is_smoothed: bool  # the noise was taken off
     delay_s: float  # of the images behind their poses, which is taken off
+    found_db: float  # in space, on this path
     calibration: FloatArray  # [4, 4] right-multiplied to the poses, mm: the identity where none is better
+    shares: Shares  # of the motion within the plane that it has
+    is_evened: bool  # across the plane
     crossing: Agreement | None  # of its passes; None where they agree as they are, or do not cross
 
     def of(self, dataset: Dataset) -> Dataset:
@@ -105,68 +110,73 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     on_path = places[: len(train)]
     given = np.concatenate([part.poses for part in whole])[order]
     ranges = path_ranges(train.probe.corners_from(given))
-    found, found_db = given, (tracked_db := judge.psnr_db(train.poses))
-    cleaned = without_noise(given, ranges)
-    if (db := judge.psnr_db(cleaned[on_path])) > found_db + LEAST_GAIN_DB:
-        found, found_db = cleaned, db
-    delay_s, found = _without_delay(judge, found, _times_of(whole), order, ranges, on_path)
-    tracked = found  # in the tracker's frame, by the calibration that was given
-    if delay_s:
-        found_db = judge.psnr_db(found[on_path])
-    calibration = found_calibration(replace(train, poses=found[on_path]), sweep_ranges(train))
-    if not np.array_equal(calibration, np.eye(4)):
-        if (db := judge.psnr_db((found @ calibration)[on_path])) >= found_db - LEAST_GAIN_DB:
-            found, found_db = found @ calibration, db
-        else:
-            calibration = np.eye(4)  # what makes neighbouring frames predict each other worse is none
-    rigid = found
-    shares = _found_shares(judge, rigid, ranges, on_path)
-    if shares != RIGID:
-        found = with_shares(rigid, ranges, train.probe, shares)
-        found_db = judge.psnr_db(found[on_path])
-    even = evened(found, ranges, train.probe)
-    if (db := judge.psnr_db(even[on_path])) > found_db + GAIN_OF_EVENNESS_DB:
-        found, found_db = even, db
-    if (crossing := crossing_agreement(train, found, ranges, on_path)) is not None:
-        if (db := judge.psnr_db((found @ crossing.motions)[on_path])) >= found_db - LOSS_OF_CROSSING_DB:
-            found, found_db = found @ crossing.motions, db
-        else:
-            crossing = None
+    tracked_db, cleaned = judge.psnr_db(train.poses), without_noise(given, ranges)
+    is_smoothed = judge.psnr_db(cleaned[on_path]) > tracked_db + LEAST_GAIN_DB
+    tracked = cleaned if is_smoothed else given  # in the tracker's frame, by the calibration that was given
+    found, delay_s = _Found.of(judge, tracked, ranges, on_path), 0.0
+    times_s = _times_of(whole)
+    if times_s is not None and len(judge.frames) >= LEAST_DELAYED:
+        ordered_s = times_s[order]
+        earlier = partial(with_delay, tracked, ordered_s, ranges)
+        likely_s = found_delay_s(lambda one_s: judge.psnr_db(earlier(one_s)[on_path]), ordered_s, ranges)
+        if likely_s:
+            other = _Found.of(judge, earlier(likely_s), ranges, on_path)
+            if other.predicted_db >= found.predicted_db + GAIN_OF_DELAY_DB:
+                tracked, found, delay_s = earlier(likely_s), other, likely_s
     noise = tracker_noise(given, ranges)
-    figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration, crossing
-    if found is given:
+    figures = judge.in_time_db(), tracked_db, noise, is_smoothed, delay_s, *found[1:]
+    if found.poses is given:
         return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if known is not None:
-        return AgreedPath(found[on_path], found[places[len(train) :]], tracked[on_path], *figures)
+        return AgreedPath(found.poses[on_path], found.poses[places[len(train) :]], tracked[on_path], *figures)
     held_out = val.poses
     if delay_s and val.times_s is not None:
         held_out = with_delay(held_out, val.times_s, sweep_ranges(val), delay_s)
-    carried = _carried(held_out, tracked, found, ranges, train.probe)
-    return AgreedPath(found[on_path], carried, tracked[on_path], *figures)
+    carried = _carried(held_out, tracked, found.poses, ranges, train.probe)
+    return AgreedPath(found.poses[on_path], carried, tracked[on_path], *figures)
+
+
+class _Found(NamedTuple):
+    """A path by all that follows the delay."""
+
+    poses: FloatArray  # [F, 4, 4] mm
+    predicted_db: float
+    calibration: FloatArray  # [4, 4] mm
+    shares: Shares
+    is_evened: bool
+    crossing: Agreement | None
+
+    @classmethod
+    def of(cls, judge: _Judge, tracked: FloatArray, ranges: Sequence[range], places: IntArray) -> _Found:
+        """From the poses [F, 4, 4] (mm) of a tracker without its noise; training frames have these places on them."""
+        train = judge.sweep
+        found, found_db = tracked, judge.psnr_db(tracked[places])
+        calibration = found_calibration(replace(train, poses=found[places]), sweep_ranges(train))
+        if not np.array_equal(calibration, np.eye(4)):
+            if (db := judge.psnr_db((found @ calibration)[places])) >= found_db - LEAST_GAIN_DB:
+                found, found_db = found @ calibration, db
+            else:
+                calibration = np.eye(4)  # what makes neighbouring frames predict each other worse is none
+        shares = _found_shares(judge, found, ranges, places)
+        if shares != RIGID:
+            found = with_shares(found, ranges, train.probe, shares)
+            found_db = judge.psnr_db(found[places])
+        even = evened(found, ranges, train.probe)
+        db, is_known = judge.psnr_db(even[places]), len(judge.frames) >= LEAST_PREDICTED
+        if is_evened := is_known and db > found_db + GAIN_OF_EVENNESS_DB:
+            found, found_db = even, db
+        if (crossing := crossing_agreement(train, found, ranges, places)) is not None:
+            if (db := judge.psnr_db((found @ crossing.motions)[places])) >= found_db - LOSS_OF_CROSSING_DB:
+                found, found_db = found @ crossing.motions, db
+            else:
+                crossing = None
+        return cls(found, found_db, calibration, shares, is_evened, crossing)
 
 
 def _times_of(parts: Sequence[Sweep]) -> FloatArray | None:  # [F] s
     """Of all frames; None where some have none."""
     times = [part.times_s for part in parts if part.times_s is not None]
     return np.concatenate(times) if len(times) == len(parts) else None
-
-
-def _without_delay(
-    judge: _Judge,
-    poses: FloatArray,  # [F, 4, 4] mm
-    times_s: FloatArray | None,  # [F], not in the order of the path
-    order: IntArray,
-    ranges: Sequence[range],
-    places: IntArray,
-) -> tuple[float, FloatArray]:
-    """The delay of the images, s, and the path without it."""
-    if times_s is None:
-        return 0.0, poses
-    ordered_s = times_s[order]
-    delay_s = found_delay_s(
-        lambda one: judge.psnr_db(with_delay(poses, ordered_s, ranges, one)[places]), ordered_s, ranges
-    )
-    return delay_s, with_delay(poses, ordered_s, ranges, delay_s) if delay_s else poses
 
 
 def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:

@@ -3,7 +3,9 @@ it. Free of torch.
 
 With the pose of another time a frame is predicted worse from those beside it, unless the probe moves evenly: a hand
 trembles, and tells a delay to some milliseconds. A path that is read between its poses is a smoother one, too, which
-may predict better whatever the delay; so a delay has to do better than its opposite.
+may predict better whatever the delay; so a delay has to do better than its opposite. Near its best a prediction falls
+with the square of the error, and the opposite loses four times as much as none. Where a delay gains by a smoother path
+or by chance it does not: so 11 of 14 delays, -400 to 130 ms, that crops and splits of a real hand's 21 frames told.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from ultragray.geometry.rotations import blended
 STEPS = (1.0, 0.5, 0.25, 0.125)  # of the usual time from one frame to the next
 MOST_S = 0.5
 LEAST_GAIN_DB = 0.03  # tissue that goes along feigns a delay that gains 0.01
+LEAST_LOSS_OF_OPPOSITE = 2.0  # in gains of the delay: 2.3 to 5 for the phantom's, where nothing else is wrong
 LEAST_STEPS = 0.2  # a delay of a smaller share of the usual time is none
 
 
@@ -66,5 +69,6 @@ def found_delay_s(
         for onwards_s in (float(step_s), -float(step_s)):
             while psnr_of(best_s + onwards_s) > psnr_of(best_s):
                 best_s += onwards_s
-    is_clear = psnr_of(best_s) >= max(psnr_of(0.0), psnr_of(-best_s)) + LEAST_GAIN_DB
+    gain_db, loss_db = (psnr_of(best_s) - psnr_of(other_s) for other_s in (0.0, -best_s))
+    is_clear = gain_db >= LEAST_GAIN_DB and loss_db >= LEAST_LOSS_OF_OPPOSITE * gain_db
     return best_s if is_clear and abs(best_s) >= LEAST_STEPS * usual_s else 0.0

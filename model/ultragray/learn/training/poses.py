@@ -22,12 +22,13 @@ from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.agreement import AgreedPath, Shares, agreed_path
 from ultragray.learn.training.alignment import register_sweeps, sweep_ranges
 from ultragray.rendering.backends.inputs import ScenePoses
-from ultragray.scene.info import SceneInfo
+from ultragray.scene.gaussians import GaussianScene
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began
 WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image hardly shows moves out of its plane
 WITH_PATH = ("path", "frames")  # refinements that begin with the path that frames agree with
+SAME_PATH = 1e-4  # mm, and of the entries of a rotation: arithmetic differs by less from machine to machine
 SMOOTHNESS = 1e-3  # weight of the squared second differences of neighbouring corrections, mm²
 
 
@@ -206,14 +207,17 @@ class PoseRefinement:
             self._trained.load(tensors)
 
 
-def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
+def held_out_on_path(dataset: Dataset, scene: GaussianScene) -> Sweep | None:
     """The held-out frames of the dataset that a scene was trained from, with the poses of the path it was trained on.
 
-    None where these are the poses of the dataset, where the scene is of another, or where nothing is held out.
+    None where these are the poses of the dataset, where the scene is of another one or was trained on another path
+    (by an earlier version), or where nothing is held out.
     """
-    if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
+    mode = scene.info.training.get("refine_poses")
+    if scene.info.dataset_sha256 != dataset.sha256 or mode not in WITH_PATH:
         return None
-    if not len(dataset.val) or (path := agreed_path(dataset)) is None:
+    if not len(dataset.val) or (path := agreed_path(dataset)) is None or path.of(dataset) is dataset:
         return None
-    placed = path.of(dataset)
-    return None if placed is dataset else placed.val
+    if mode == "path" and not np.allclose(scene.at_rest().training_poses, path.train, atol=SAME_PATH):
+        return None
+    return path.of(dataset).val

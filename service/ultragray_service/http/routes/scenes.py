@@ -206,8 +206,15 @@ async def make_scene(request: Request, service: ServiceDep) -> Scene:
 class ScenePoses:
     """Training poses of a scene, evenly taken."""
 
-    poses: list[list[float]] = described("16 numbers each, row by row, mm.")
-    shift_mm: list[float] | None = described("How far each was corrected in the training; null: none was.", None)
+    poses: list[list[float]] = described("As tracked, without the tracker's noise: 16 numbers each, row by row, mm.")
+    rest_poses: list[list[float]] | None = described(
+        "Where the tissue at rest looks as it does from `poses`: those that the scene was trained on. null: `poses`.",
+        None,
+    )
+    shift_mm: list[float] | None = described(
+        "How far each was moved from where the tracker had it to where the scene was trained on it; null: none was.",
+        None,
+    )
     turn_deg: list[float] | None = described("And turned.", None)
 
 
@@ -251,7 +258,7 @@ async def get_gaussians(
 
 @router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
 async def get_training_poses(request: Request, service: ServiceDep, scene: SceneName) -> Response:
-    """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
+    """The poses that the scene was trained from and those it was trained on, at most 10,000, evenly taken."""
 
     async def poses() -> bytes:
         return await asyncio.to_thread(_poses_json, await service.catalog.header(scene))
@@ -339,9 +346,12 @@ async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
 
 
 def _poses_json(header: SceneHeader) -> bytes:
-    poses, corrections = header.training_poses, header.pose_corrections
-    chosen = even_selection(len(poses), MAX_POSES)
-    sizes: dict[str, Any] = {"shift_mm": None, "turn_deg": None}
-    if corrections is not None:
-        sizes = CorrectionSizes.of(corrections[chosen], poses[chosen]).to_dict()
-    return json.dumps({"poses": poses[chosen].reshape(-1, 16).tolist(), **sizes}).encode()
+    chosen = even_selection(len(header.training_poses), MAX_POSES)
+    sizes = CorrectionSizes.of(header)
+    found = {
+        "poses": header.training_poses.reshape(-1, 16),
+        "rest_poses": None if header.rest_poses is None else header.rest_poses.reshape(-1, 16),
+        "shift_mm": None if sizes is None else sizes.shift_mm,
+        "turn_deg": None if sizes is None else sizes.turn_deg,
+    }
+    return json.dumps({name: None if one is None else one[chosen].tolist() for name, one in found.items()}).encode()

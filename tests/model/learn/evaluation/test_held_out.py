@@ -67,7 +67,7 @@ def test_three_scores_stand_side_by_side(tiny_config):
     as_given = evaluate(scene, given.val)
     scores = score_held_out(scene, given, as_given)
     assert list(scores.rows) == ["as given", "on the path"]
-    on_path = evaluate(scene.at_rest(), held_out_on_path(given, scene.info)).mean
+    on_path = evaluate(scene.at_rest(), held_out_on_path(given, scene)).mean
     assert scores.figures() == {f"on_path_{name}": value for name, value in on_path.to_dict().items()}
     document = scores.to_dict()
     assert document["as_given"]["mean"] == as_given.mean.to_dict()

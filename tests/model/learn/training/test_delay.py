@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from ultragray.datasets.checks import check_dataset
+from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import agreement
 from ultragray.learn.training.agreement import agreed_path
 from ultragray.learn.training.alignment import found_calibration, sweep_ranges
 from ultragray.learn.training.delay import with_delay
@@ -33,14 +35,25 @@ def recorded(delay_frames, **more):
 
 def test_a_delay_is_found_and_taken_off(found_paths):
     given = recorded(1.0, times_s=SPACING_S * np.arange(FRAMES))
-    told, truth = " ".join(check_dataset(given).warnings), trembling_path(np.arange(FRAMES))
+    report, truth = check_dataset(given), trembling_path(np.arange(FRAMES))
     (path,) = found_paths
     assert path.delay_s == pytest.approx(SPACING_S, abs=0.2 * SPACING_S)
-    assert f"{1000.0 * path.delay_s:.0f} ms later than their poses" in told
+    assert "delay" in report.path.causes
     for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
         assert error_mm(poses, true) < 0.3 * error_mm(tracked.poses, true)
     assert agreed_path(recorded(0.0, times_s=SPACING_S * np.arange(FRAMES))).delay_s == 0.0
     assert agreed_path(recorded(1.0)).delay_s == 0.0  # the frames have no times
+
+
+@pytest.mark.parametrize(("crop", "kept"), [("188:632,12:600", "0:21"), ("180:640,20:300", "1:21:2")])
+def test_a_real_hand_of_a_few_frames_tells_no_delay(data_folder, monkeypatch, crop, kept):
+    """One explains frames at 129 ms, but its opposite does so nearly as well; shares explain them better than -398."""
+    folder = data_folder / "plus_freehand"
+    options = SourceOptions(device_set=folder / "BoneUltrasound_L14_config.xml", crop=crop, train_frames=kept)
+    given = load_dataset(str(folder / "BoneUltrasound_L14.igs.mha"), options)
+    assert agreed_path(given).delay_s == 0.0
+    monkeypatch.setattr(agreement, "LEAST_DELAYED", 1)
+    assert agreed_path(given).delay_s == 0.0
 
 
 def test_poses_of_another_time_lie_on_the_path():
@@ -58,8 +71,7 @@ def test_a_calibration_that_is_off_is_found_where_sweeps_cross(found_paths):
     given = replace(images, poses=truth @ off)
     ranges = [range(30), range(30, 60)]
     assert sweep_ranges(given) == ranges
-    told = " ".join(check_dataset(Dataset("crossing", given, given.select([]))).warnings)
-    assert "calibration from the image to the probe seems to be off by" in told
+    assert "calibration" in check_dataset(Dataset("crossing", given, given.select([]))).path.causes
     found = off @ found_paths[0].calibration
     left, before = (PROBE.corners_from(one[None]) - PROBE.corners_mm() for one in (found, off))
     assert np.linalg.norm(left, axis=-1).mean() < 0.3 * np.linalg.norm(before, axis=-1).mean()

@@ -20,6 +20,7 @@ from ultragray.learn.training.alignment import (
     without_noise,
 )
 from ultragray.learn.training.poses import PoseRefinement, SweepCorrections, turned_by
+from ultragray.scene.info import SceneHeader, SceneInfo
 
 from ..conftest import make_tiny_config, make_tiny_dataset
 
@@ -204,9 +205,13 @@ def test_a_resumed_run_gives_the_same_corrections(corrected, tmp_path):
 
 def test_the_sizes_of_corrections():
     corrections = poses_of(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]))
-    sizes = CorrectionSizes.of(corrections, corrections @ np.tile(np.eye(4), (2, 1, 1)))
-    np.testing.assert_allclose(sizes.shift_mm, [0.0, 5.0], atol=1e-9)
-    np.testing.assert_allclose(sizes.turn_deg, [3.0, 0.0], atol=1e-9)
+    scene = SceneHeader(SceneInfo(), corrections, 0)
+    assert CorrectionSizes.of(scene) is None
+    corrected = replace(scene, pose_corrections=corrections)
+    at_rest = replace(scene, training_poses=np.tile(np.eye(4), (2, 1, 1)), rest_poses=corrections)
+    for sizes in map(CorrectionSizes.of, (corrected, at_rest)):
+        np.testing.assert_allclose(sizes.shift_mm, [0.0, 5.0], atol=1e-9)
+        np.testing.assert_allclose(sizes.turn_deg, [3.0, 0.0], atol=1e-9)
     assert str(sizes) == (
         "poses of 2 training frames were corrected by 2.50 mm (at most 5.00) and 1.50° (at most 3.00) on average"
     )

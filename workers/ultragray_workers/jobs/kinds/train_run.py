@@ -23,9 +23,11 @@ from ultragray.learn.sweep import Dataset, spread_places
 from ultragray.learn.training import Progress as TrainingProgress
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training import train as train_scene
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.learn.training.confidence import BLACK_FRAMES, LEAST_HELD_OUT, MEASURED_FRAMES, held_out_frames
 from ultragray.learn.training.memory import machine_in_words
 from ultragray.learn.training.pictures import pictures_in
+from ultragray.learn.training.poses import WITH_PATH
 from ultragray.learn.training.progress import Course
 from ultragray.learn.training.run import FITTING
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE, VALIDATION_FRAMES
@@ -42,14 +44,16 @@ _LINES = 20  # of the log in a run
 MAX_PIXELS = 1 << 26  # of the sweep: about ten seconds; a larger one begins at once, without the lines
 
 
-def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool]) -> None:
-    """Writes the PSNR in dB of each method, by name, as JSON.
+def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool], refine_poses: str) -> None:
+    """Writes the PSNR in dB of each method, by name, as JSON: by the same poses as the training's own, on its path.
 
     Nothing where there is a file already, no frame is held out, the sweep is too large, or it is to stop.
     """
     if path.exists() or not len(dataset.val) or dataset.train.images.size > MAX_PIXELS:
         return
-    few = replace(dataset, val=dataset.val.select(spread_places(len(dataset.val), VALIDATION_FRAMES)))
+    agreed = agreed_path(dataset) if refine_poses in WITH_PATH else None
+    placed = dataset if agreed is None else agreed.of(dataset)
+    few = replace(placed, val=placed.val.select(spread_places(len(placed.val), VALIDATION_FRAMES)))
     voxel_mm = affordable_voxel_mm(dataset.train)
     found: dict[str, float] = {}
     for method in METHODS:
@@ -126,7 +130,7 @@ def run(job_run: JobRun, job: TrainJob, *, better: GaussianScene | None = None, 
     )
     if not resume:
         job_run.report(Progress(phase="baselines"))
-        write_baselines(dataset, job_run.folder.run / BASELINES_NAME, job_run.should_stop)
+        write_baselines(dataset, job_run.folder.run / BASELINES_NAME, job_run.should_stop, config.refine_poses)
     finishing = Finishing(dataset, config)
     scene = train_scene(
         dataset,
