@@ -69,6 +69,9 @@ class Unread:
                 self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
     def write(self, message: bytes) -> None:
+        """Raises ConnectionResetError where the client is gone: uvloop's own error would be that of a fault."""
+        if self._transport.is_closing():
+            raise ConnectionResetError
         if (state := self._state()) is not None:
             self._window_bytes = max(self._window_bytes, state.window_bytes)
         self._message_bytes = len(message)

@@ -5,8 +5,9 @@ import ssl
 
 import pytest
 import trustme
+import uvloop
 
-from ultragray_service.core.unread import hold_little
+from ultragray_service.core.unread import Unread, hold_little
 
 FRAMES = 3
 
@@ -31,6 +32,29 @@ def test_a_client_that_says_nothing_gets_every_frame(certificates, is_tls):
             await writer.wait_closed()
 
     asyncio.run(talk())
+
+
+def test_a_client_that_has_gone_gets_no_more_messages():
+    ended = []
+
+    async def send(_, writer):
+        unread = Unread(writer.transport)
+        try:
+            while True:
+                unread.write(b"frame")
+                await asyncio.sleep(0)
+        except Exception as error:
+            ended.append(error)
+
+    async def talk():
+        async with asyncio.timeout(300), await asyncio.start_server(send, "127.0.0.1", 0) as server:
+            _, writer = await asyncio.open_connection("127.0.0.1", server.sockets[0].getsockname()[1])
+            writer.transport.abort()
+            while not ended:
+                await asyncio.sleep(0.01)
+
+    uvloop.run(talk())
+    assert isinstance(ended[0], ConnectionResetError)
 
 
 @pytest.fixture
