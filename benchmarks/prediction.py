@@ -53,14 +53,14 @@ def robot(_: Path) -> Path_:
     return measured_at(125.0, ROBOT_NOISE, truth)
 
 
-def recorded(name: str, device_set: str | None, data_folder: Path) -> Path_:
-    """A sequence of PLUS."""
+def recorded(name: str, device_set: str, data_folder: Path) -> Path_:
+    """A sequence of PLUS, with the frames that a training holds out."""
     source = data_folder / name
-    options = SourceOptions(device_set=None if device_set is None else source.with_name(device_set))
-    sweep = load_dataset(str(source), options).train
-    assert sweep.times_s is not None
-    times_s, poses = sweep.times_s, sweep.poses
-    return times_s, poses, partial(straight, times_s, poses)
+    dataset = load_dataset(str(source), SourceOptions(device_set=source.with_name(device_set)))
+    parts = (dataset.train, dataset.val)
+    times_s, poses = (np.concatenate([getattr(part, of) for part in parts]) for of in ("times_s", "poses"))
+    order = np.argsort(times_s)
+    return times_s[order], poses[order], partial(straight, times_s[order], poses[order])
 
 
 def measured_at(rate_hz: float, noise: float, truth: Poses) -> Path_:
@@ -134,6 +134,11 @@ RUNS = {
         recorded,
         "plus_original/SpinePhantomFreehand.igs.mha",
         "PlusDeviceSet_SpinePhantomFreehandReconstructionOnly.xml",
+    ),
+    "recorded hand on wires, 13 Hz": partial(
+        recorded,
+        "plus_original/fCal_Test_Calibration_3NWires_fCal2.0.igs.mha",
+        "PlusDeviceSet_fCal_Sim_VolumeReconstruction.xml",
     ),
 }
 
