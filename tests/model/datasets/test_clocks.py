@@ -55,7 +55,7 @@ def recorded(motion, delay_s, count=160):
 @pytest.fixture
 def quick_checks(monkeypatch):
     """Without what the images say of the path: that takes seconds, and has tests of its own."""
-    monkeypatch.setattr(checks, "_dataset_warnings", lambda dataset: ())
+    monkeypatch.setattr(checks, "agreed_path", lambda dataset: None)
 
 
 def report_of(sweep):
