@@ -141,7 +141,10 @@ def settings_message(scene: str, settings: RenderSettings | None) -> rendering_p
 
 
 def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropped: int = 0, data: Any = None) -> Frame:
-    """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own."""
+    """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own.
+
+    `message`: also a LargeFrame.
+    """
     dtype = _PIXEL_TYPES[_ENCODINGS[message.encoding]]
     pixels = np.frombuffer(message.data if data is None else data, dtype)
     pixels.setflags(write=False)

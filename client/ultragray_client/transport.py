@@ -26,7 +26,7 @@ from ultragray_client.connection import CHANNEL_OPTIONS, ApiKey, Metadata, Retri
 from ultragray_client.conversations import Conversation
 from ultragray_client.errors import ClientError, NotFound
 from ultragray_client.exchange import PoseExchange
-from ultragray_client.messages import message_of
+from ultragray_client.messages import message_of, received_frame
 from ultragray_client.stream import AsyncFrameStream, FrameStream
 from ultragray_proto.codec import from_message
 
@@ -35,6 +35,7 @@ T = TypeVar("T")
 Now = TypeVar("Now")
 Later = TypeVar("Later")
 PAGE_SIZE = 1000  # the most that the service gives at once
+_READERS = {"Frame": received_frame}  # of messages by name; others are read by protobuf
 
 
 class Connection(Terms):
@@ -62,7 +63,8 @@ class Connection(Terms):
             self._methods[name] = getattr(self._channel, "_".join(words))(
                 f"/{found.containing_service.full_name}/{found.name}",
                 request_serializer=GetMessageClass(found.input_type).SerializeToString,
-                response_deserializer=GetMessageClass(found.output_type).FromString,
+                response_deserializer=_READERS.get(found.output_type.name)
+                or GetMessageClass(found.output_type).FromString,
             )
         return self._methods[name]
 

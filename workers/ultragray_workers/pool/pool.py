@@ -45,7 +45,7 @@ R = TypeVar("R")
 
 MAX_REPLY_BYTES = 2**31 - 2**20
 MAX_SCENE_CHANGES = 3
-_READ_IN_THREAD_BYTES = 2**20
+_READ_IN_THREAD_BYTES = 16 * 2**20  # fewer are read within the event loop in some milliseconds at most
 
 
 @dataclass(frozen=True)
