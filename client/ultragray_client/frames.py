@@ -25,7 +25,7 @@ from ultragray_client.contract import (
 )
 from ultragray_client.errors import InvalidArgument
 from ultragray_client.geometry import FloatArray, PoseLike, pose_message
-from ultragray_client.messages import message_of
+from ultragray_client.messages import LargeFrame, message_of
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import recordings_pb2, rendering_pb2
 
@@ -140,11 +140,10 @@ def settings_message(scene: str, settings: RenderSettings | None) -> rendering_p
     return message_of(settings, rendering_pb2.RenderSettings, scene=scene)
 
 
-def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropped: int = 0, data: Any = None) -> Frame:
-    """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own.
-
-    `message`: also a LargeFrame.
-    """
+def frame_from_message(
+    message: rendering_pb2.Frame | LargeFrame, *, sequence: int = 0, dropped: int = 0, data: Any = None
+) -> Frame:
+    """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own."""
     dtype = _PIXEL_TYPES[_ENCODINGS[message.encoding]]
     pixels = np.frombuffer(message.data if data is None else data, dtype)
     pixels.setflags(write=False)
