@@ -301,9 +301,17 @@ class BoundedHttp(HttpToolsProtocol):
         """Says that nothing more is sent, throws away what still comes, and closes a moment later."""
         self._is_over = True
         self.flow.resume_reading()
-        if self.transport.can_write_eof() and not self.transport.is_closing():
-            self.transport.write_eof()
-        self.loop.call_later(_LINGER_S, self.transport.abort)
+        _say_no_more(self.transport, self.loop)
+
+
+def _say_no_more(transport: Any, loop: asyncio.AbstractEventLoop) -> asyncio.TimerHandle:
+    """Ends the side of a connection that sends, and the connection a moment later.
+
+    A connection that is closed with bytes unread is reset, and a client that is still sending then loses its answer.
+    """
+    if transport.can_write_eof() and not transport.is_closing():
+        transport.write_eof()
+    return loop.call_later(_LINGER_S, transport.abort)
 
 
 class _Closing:
@@ -338,6 +346,7 @@ class _BoundedWebSocket(PromptWebSocket):
     Frames that carry nothing are counted: pings, pongs that answer none of ours, empty fragments. Whoever sends more
     than MAX_EMPTY_FRAMES at once, and EMPTY_FRAMES_PER_S in the long run, is closed with 1008. The rest is not read,
     and the connection keeps its place for a moment: a client that comes again at once would cost a handshake each time.
+    What follows a message that breaks the protocol or is too long is read for a moment, and thrown away.
     """
 
     _is_over = False
@@ -368,6 +377,15 @@ class _BoundedWebSocket(PromptWebSocket):
         if not event.data:
             self._count_empty()
         super().handle_cont(event)
+
+    def handle_parser_exception(self) -> None:
+        closed = self.conn.close_sent
+        assert closed is not None
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": closed.code, "reason": closed.reason})
+        self._write()
+        self._is_over = self.close_sent = True
+        self.transport.resume_reading()
+        self.close_timer = _say_no_more(self.transport, self.loop)
 
     def _count_empty(self) -> None:
         now = self.loop.time()
