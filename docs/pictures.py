@@ -592,7 +592,7 @@ def draw_registration(scene: GaussianScene, path: Path) -> None:
     save(figure, path)
 
 
-def draw_hand(path: Path) -> None:
+def draw_hand(picture: Path) -> None:
     """A plane along the sweep of a hand, compounded by three kinds of poses: a tracker that shakes, and a calibration
     that is off."""
     along = np.array([[0.0, -1.0, 0.0, 8.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -615,7 +615,7 @@ def draw_hand(path: Path) -> None:
             panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=(-25.0, 25.0, 45.0, 0.0))
             panel.set_title(title, fontsize=8)
         panels[row * len(titles)].set_ylabel(name, fontsize=8)
-    save(figure, path)
+    save(figure, picture)
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

@@ -1,8 +1,7 @@
-"""Parts about the interfaces: HTTP from the OpenAPI document, gRPC from the .proto files and their comments."""
+"""Parts about the interfaces: HTTP from the OpenAPI document, gRPC from the .proto files."""
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,10 +17,6 @@ from ultragray_service.wiring import make_service
 from .markdown import code, codes, in_line, prose, sections, table
 
 FILES = sorted((Path(__file__).resolve().parents[2] / "proto" / "ultragray" / "v1").glob("*.proto"))
-_BLOCK = re.compile(r"((?:^//.*\n)*)^(message|enum|service) (\w+) \{(?:\}|\n((?s:.*?))^\})$", flags=re.M)
-_FIELD = re.compile(r"((?:^ +//.*\n)*)^ +((?:\w|[.<>, ])+?) (\w+) = (\d+);(?: +// (.*))?$", flags=re.M)
-_VALUE = re.compile(r"^ +(\w+) = (\d+);(?: +// (.*))?$", flags=re.M)
-_METHOD = re.compile(r"((?:^ +//.*\n)*)^ +rpc (\w+)\(([\w ]+)\) returns \(([\w ]+)\)", flags=re.M)
 
 
 @contextmanager
@@ -131,47 +126,11 @@ def _kind(schema: dict[str, Any]) -> str:
     return str(schema.get("type", "any"))
 
 
-def services() -> str:
-    return sections(3, _blocks("service"))
+def contract() -> str:
+    """The .proto files, whose comments say what each message is for."""
+    return sections(3, ((path.name, f"```proto\n{_without_origin(path)}```") for path in FILES))
 
 
-def messages() -> str:
-    return sections(3, _blocks("message"))
-
-
-def enums() -> str:
-    return sections(3, _blocks("enum"))
-
-
-def _blocks(wanted: str) -> Iterator[tuple[str, str]]:
-    for path in FILES:
-        for comment, kind, name, body in _BLOCK.findall(path.read_text(encoding="utf-8")):
-            if kind == wanted:
-                yield name, "\n\n".join(part for part in (_words(comment), _BODIES[kind](body)) if part)
-
-
-def _words(comment: str) -> str:
-    return prose(" ".join(line.strip().removeprefix("//").strip() for line in comment.splitlines()))
-
-
-def _service(body: str) -> str:
-    rows = (
-        (code(name), code(taken), code(given), _words(comment)) for comment, name, taken, given in _METHOD.findall(body)
-    )
-    return table(("Method", "Request", "Answer", "Meaning"), rows)
-
-
-def _message(body: str) -> str:
-    rows = (
-        (code(name), number, code(kind.replace("google.protobuf.", "")), in_line(f"{_words(above)} {beside}"))
-        for above, kind, name, number, beside in _FIELD.findall(body)
-    )
-    return table(("Field", "Number", "Type", "Meaning"), rows) or "Without fields."
-
-
-def _enum(body: str) -> str:
-    rows = ((code(name), number, in_line(comment)) for name, number, comment in _VALUE.findall(body))
-    return table(("Value", "Number", "Meaning"), rows)
-
-
-_BODIES = {"service": _service, "message": _message, "enum": _enum}
+def _without_origin(path: Path) -> str:
+    """A .proto file without its first line, which names the template that it is written from."""
+    return path.read_text(encoding="utf-8").partition("\n")[2]
