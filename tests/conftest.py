@@ -1,6 +1,8 @@
 """Fixtures shared by all tests: golden files, random scenes, and the rule by which two renders agree."""
 
+import asyncio
 import gc
+import inspect
 import json
 import math
 import os
@@ -54,6 +56,7 @@ os.environ["PYTEST_RUN"] = str(os.getpid())  # in the environment of every proce
 
 BEGAN = time.monotonic()
 SHARED = ROOT.parent / "shared"
+HUNG_S = 600.0  # a test that waits for longer fails
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
 
 
@@ -81,6 +84,20 @@ def clock(monkeypatch):
         monkeypatch.setattr(time, name, loop.time)
     yield loop
     loop.close()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """A test that is a coroutine function runs to its end on a loop of its own, or on its `clock`."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    test = pyfuncitem.obj(**arguments)
+    if "clock" in arguments:
+        arguments["clock"].run_until_complete(test)
+    else:
+        asyncio.run(asyncio.wait_for(test, HUNG_S))
+    return True
 
 
 @pytest.fixture

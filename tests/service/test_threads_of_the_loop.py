@@ -85,14 +85,7 @@ def test_long_work_leaves_the_threads_of_the_loop(name, tmp_path, demo_scene, bl
     asyncio.run(main())
 
 
-def test_many_may_wait_and_none_keeps_the_loop_from_ending():
-    never = threading.Event()
-
-    async def run():
-        waiting = [asyncio.ensure_future(in_own_thread(never.wait)) for _ in range(50)]
-        result = await in_own_thread(lambda: 7)
-        assert not any(task.done() for task in waiting)
-        return result
-
-    assert asyncio.run(run()) == 7
-    never.set()
+async def test_many_may_wait_and_none_keeps_the_loop_from_ending(blocked):
+    waiting = [asyncio.ensure_future(in_own_thread(blocked.wait)) for _ in range(50)]
+    assert await in_own_thread(lambda: 7) == 7
+    assert not any(task.done() for task in waiting)

@@ -23,18 +23,15 @@ def test_a_failure_is_logged_once_with_its_traceback_and_so_is_its_end(caplog):
     assert "Traceback" in caplog.text
 
 
-def test_cancelling_ends_a_loop():
-    async def run():
-        async def loop():
-            rounds = Rounds("the watch", LOG)
-            while True:
-                with rounds.round():
-                    await asyncio.sleep(3600)
+async def test_cancelling_ends_a_loop():
+    async def loop():
+        rounds = Rounds("the watch", LOG)
+        while True:
+            with rounds.round():
+                await asyncio.sleep(3600)
 
-        task = asyncio.ensure_future(loop())
-        await asyncio.sleep(0)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    asyncio.run(run())
+    task = asyncio.ensure_future(loop())
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task

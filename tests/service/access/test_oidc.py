@@ -144,14 +144,6 @@ async def until(condition):
         await asyncio.sleep(0.01)
 
 
-def with_tokens(provider, check, **settings):
-    async def run():
-        async with following(provider, **settings) as tokens:
-            check(tokens)
-
-    asyncio.run(run())
-
-
 def unsigned(header, claims, signature=b""):
     parts = (json.dumps(header).encode(), json.dumps(claims).encode(), signature)
     return ".".join(base64.urlsafe_b64encode(part).rstrip(b"=").decode() for part in parts)
@@ -172,28 +164,23 @@ def refusal(tokens, token):
 
 
 @pytest.mark.parametrize("algorithm", ["RS256", "ES256", "EdDSA"])
-def test_a_token_becomes_a_principal(provider, algorithm):
+async def test_a_token_becomes_a_principal(provider, algorithm):
     provider.add_key("two", algorithm)
-
-    def check(tokens):
+    token = provider.token("two")
+    async with following(provider) as tokens:
         principal = tokens.authenticate(token)
         assert (principal.name, principal.role, principal.source) == ("oidc:alice", Role.READER, "oidc")
         assert principal.expires_at_s == jwt.decode(token, options={"verify_signature": False})["exp"] + LEEWAY_S
         assert tokens.authenticate(token) is principal, "the signature is verified once"
 
-    token = provider.token("two")
-    with_tokens(provider, check)
 
-
-def test_what_is_no_token_is_left_to_other_sources(provider):
-    def check(tokens):
+async def test_what_is_no_token_is_left_to_other_sources(provider):
+    async with following(provider) as tokens:
         for credential in ("", "ultragray_abcdefgh", "a.b", "a.b.c.d", "ä.b.c", "a.b.c\n", "." * 50_000):
             assert tokens.authenticate(credential) is None
 
-    with_tokens(provider, check)
 
-
-def test_tokens_that_are_refused_say_why(provider):
+async def test_tokens_that_are_refused_say_why(provider):
     now = time.time()
     foreign = rsa.generate_private_key(65537, 2048)
     algorithm = "names an algorithm that its key does not allow"
@@ -219,26 +206,20 @@ def test_tokens_that_are_refused_say_why(provider):
         provider.token(realm_access=None): "PermissionDenied: ",
         provider.token(realm_access={"roles": [{}, None, 7]}): "PermissionDenied: ",
     }
-
-    def check(tokens):
+    async with following(provider) as tokens:
         for token, expected in refusals.items():
             assert expected in refusal(tokens, token)
 
-    with_tokens(provider, check)
 
-
-def test_clocks_may_differ_a_little(provider):
+async def test_clocks_may_differ_a_little(provider):
     now = int(time.time())
-
-    def check(tokens):
+    async with following(provider) as tokens:
         assert tokens.authenticate(provider.token(exp=now - 5))
         assert tokens.authenticate(provider.token(nbf=now + 5, iat=now + 5))
 
-    with_tokens(provider, check)
 
-
-def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider):
-    def check(tokens):
+async def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider):
+    async with following(provider) as tokens:
         principal = tokens.authenticate(provider.token(exp=10**300))
         assert principal.expires_at_s is not None
         assert "cannot be read" in refusal(tokens, provider.token(exp=float("inf")))
@@ -247,67 +228,50 @@ def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider):
         nested = base64.urlsafe_b64encode(b"[" * 6000).rstrip(b"=").decode()
         assert refusal(tokens, f"{nested}.{deep[1]}.{deep[2]}")
 
-    with_tokens(provider, check)
 
+async def test_the_highest_role_counts_wherever_the_claim_lies(provider):
+    async def role_by(claim, value):
+        async with following(provider, oidc_role_claim=claim) as tokens:
+            return tokens.authenticate(provider.token(**{claim: value})).role
 
-def test_the_highest_role_counts_wherever_the_claim_lies(provider):
-    def roles_of(claim, **claims):
-        found = []
-
-        def check(tokens):
-            principal = tokens.authenticate(provider.token(**claims))
-            found.append(principal.role)
-
-        with_tokens(provider, check, oidc_role_claim=claim)
-        return found[0]
-
-    assert roles_of("groups", groups=["radiology", "research"]) is Role.OPERATOR
-    assert roles_of("scope", scope="openid ultragray-admin") is Role.ADMIN
-    name = "https://hospital.example/roles"
-    assert roles_of(name, **{name: ["radiology"]}) is Role.READER
+    assert await role_by("groups", ["radiology", "research"]) is Role.OPERATOR
+    assert await role_by("scope", "openid ultragray-admin") is Role.ADMIN
+    assert await role_by("https://hospital.example/roles", ["radiology"]) is Role.READER
     assert claim_at({"a": {"b": [1]}}, "a.b") == [1]
     assert claim_at({"a": "text"}, "a.b.c") is None
 
 
-def test_new_keys_are_fetched_when_a_token_names_them(provider, monkeypatch):
+async def test_new_keys_are_fetched_when_a_token_names_them(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.2)
-
-    async def run():
-        async with following(provider) as tokens:
-            before = provider.token("one")
-            assert tokens.authenticate(before)
-            provider.add_key("two")
-            provider.remove_key("one")
-            assert tokens.authenticate(before), "not looked at yet"
-            assert "IssuerUnavailable: the token names a new key" in refusal(tokens, provider.token("two"))
-            await until(lambda: "two" in tokens.issuer.keys)
-            assert tokens.authenticate(provider.token("two"))
-            assert "IssuerUnavailable" in refusal(tokens, before), "the key was taken out; it may have come back"
-            await until(lambda: "does not have" in refusal(tokens, before))
-            fetches = provider.fetches
-            for _ in range(100):
-                assert "does not have" in refusal(tokens, before)
-            await asyncio.sleep(0.3)
-            assert provider.fetches == fetches, "keys that the issuer does not have are not asked for again and again"
-
-    asyncio.run(run())
+    async with following(provider) as tokens:
+        before = provider.token("one")
+        assert tokens.authenticate(before)
+        provider.add_key("two")
+        provider.remove_key("one")
+        assert tokens.authenticate(before), "not looked at yet"
+        assert "IssuerUnavailable: the token names a new key" in refusal(tokens, provider.token("two"))
+        await until(lambda: "two" in tokens.issuer.keys)
+        assert tokens.authenticate(provider.token("two"))
+        assert "IssuerUnavailable" in refusal(tokens, before), "the key was taken out; it may have come back"
+        await until(lambda: "does not have" in refusal(tokens, before))
+        fetches = provider.fetches
+        for _ in range(100):
+            assert "does not have" in refusal(tokens, before)
+        await asyncio.sleep(0.3)
+        assert provider.fetches == fetches, "keys that the issuer does not have are not asked for again and again"
 
 
-def test_many_unknown_keys_are_one_fetch(provider, monkeypatch):
+async def test_many_unknown_keys_are_one_fetch(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.5)
-
-    async def run():
-        async with following(provider) as tokens:
-            fetches = provider.fetches
-            for number in range(300):
-                assert refusal(tokens, provider.token(headers={"kid": f"made up {number}"}))
-            await until(lambda: provider.fetches > fetches)
-            assert provider.fetches == fetches + 1
-
-    asyncio.run(run())
+    async with following(provider) as tokens:
+        fetches = provider.fetches
+        for number in range(300):
+            assert refusal(tokens, provider.token(headers={"kid": f"made up {number}"}))
+        await until(lambda: provider.fetches > fetches)
+        assert provider.fetches == fetches + 1
 
 
-def test_keys_that_sign_no_tokens_are_passed_over(provider):
+async def test_keys_that_sign_no_tokens_are_passed_over(provider):
     provider.add_key("encryption", use="enc")
     provider.add_key("other", alg="RSA-OAEP")
     small = RSAAlgorithm.to_jwk(rsa.generate_private_key(65537, 1024).public_key(), as_dict=True)
@@ -317,36 +281,33 @@ def test_keys_that_sign_no_tokens_are_passed_over(provider):
         {"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA", "kid": "broken"},
         {"kty": "new", "kid": "new"},
     ]
-    found = []
-    with_tokens(provider, lambda tokens: found.append(set(tokens.issuer.keys)))
-    assert found == [{"one", None}]
+    async with following(provider) as tokens:
+        assert set(tokens.issuer.keys) == {"one", None}
 
 
-def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider):
+async def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider):
     token = jwt.encode(provider.claims(), provider.keys["one"][1], "RS256")
-    with_tokens(provider, lambda tokens: tokens.authenticate(token))
+    async with following(provider) as tokens:
+        assert tokens.authenticate(token)
     provider.add_key("two")
-    with_tokens(provider, lambda tokens: refusal(tokens, token))
+    async with following(provider) as tokens:
+        assert refusal(tokens, token)
 
 
-def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(provider, monkeypatch):
+async def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.05)
     monkeypatch.setattr(issuer_module, "REFRESH_S", 0.1)
     monkeypatch.setattr(issuer_module, "RETRY_S", 0.1)
-
-    async def run():
-        async with following(provider) as tokens:
-            provider.up = False
-            await until(lambda: tokens.issuer.problem is not None)
-            assert tokens.authenticate(provider.token())
-            provider.add_key("two")
-            with pytest.raises(IssuerUnavailable, match="its issuer does not answer"):
-                tokens.authenticate(provider.token("two"))
-            provider.up = True
-            await until(lambda: tokens.issuer.problem is None)
-            assert tokens.authenticate(provider.token("two"))
-
-    asyncio.run(run())
+    async with following(provider) as tokens:
+        provider.up = False
+        await until(lambda: tokens.issuer.problem is not None)
+        assert tokens.authenticate(provider.token())
+        provider.add_key("two")
+        with pytest.raises(IssuerUnavailable, match="its issuer does not answer"):
+            tokens.authenticate(provider.token("two"))
+        provider.up = True
+        await until(lambda: tokens.issuer.problem is None)
+        assert tokens.authenticate(provider.token("two"))
 
 
 @pytest.mark.parametrize(
@@ -356,17 +317,13 @@ def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(provider, monkeyp
         ("", "http://hospital.example", "token_endpoint must be a URL"),
     ],
 )
-def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(provider, end, token_endpoint, problem):
+async def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(provider, end, token_endpoint, problem):
     provider.endpoints = {"authorization_endpoint": f"{provider.url}/auth", "token_endpoint": token_endpoint}
-
-    async def run():
-        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + end}))
-        task = asyncio.ensure_future(tokens.issuer.follow())
-        await until(lambda: problem in str(tokens.issuer.problem))
-        assert (tokens.issuer.keys, tokens.issuer.endpoints) == ({}, None)
-        task.cancel()
-
-    asyncio.run(run())
+    tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + end}))
+    task = asyncio.ensure_future(tokens.issuer.follow())
+    await until(lambda: problem in str(tokens.issuer.problem))
+    assert (tokens.issuer.keys, tokens.issuer.endpoints) == ({}, None)
+    task.cancel()
 
 
 @pytest.mark.parametrize(

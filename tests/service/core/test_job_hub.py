@@ -78,90 +78,71 @@ def one(tmp_path):
     return OneJob(tmp_path)
 
 
-def run(work):
-    asyncio.run(asyncio.wait_for(work, WAIT_S))
-
-
 async def change(watch):
     found = await watch.next(WAIT_S)
     assert found is not None
     return found
 
 
-def test_many_watchers_cost_as_many_reads_as_one(one):
-    async def work():
-        watches = [await one.hub.watch("one") for _ in range(50)]
-        for watch in watches:
-            assert (await change(watch)).job == one.job
-        before = one.reads
-        await asyncio.gather(*(watch.next(10 * INTERVAL_S) for watch in watches))
-        assert one.reads - before <= 11
-        one.move(progress=Progress(step=3))
-        for found in await asyncio.gather(*map(change, watches)):
-            assert found.job == one.job
-
-    run(work())
+async def test_many_watchers_cost_as_many_reads_as_one(one):
+    watches = [await one.hub.watch("one") for _ in range(50)]
+    for watch in watches:
+        assert (await change(watch)).job == one.job
+    before = one.reads
+    await asyncio.gather(*(watch.next(10 * INTERVAL_S) for watch in watches))
+    assert one.reads - before <= 11
+    one.move(progress=Progress(step=3))
+    for found in await asyncio.gather(*map(change, watches)):
+        assert found.job == one.job
 
 
-def test_a_watch_ends_after_the_final_state_and_the_last_line(one):
-    async def work():
-        one.log_path.write_text("begin\n")
-        watch = await one.hub.watch("one")
-        assert await change(watch) == JobChange(one.job, "begin\n", 6)
-        assert not watch.finished
-        one.log_path.write_text("begin\nend\n")
-        one.move(state=JobState.SUCCEEDED)
-        told = [await change(watch)]
-        if told[0].job is None:  # the line was read before the state
-            told.append(await change(watch))
-        assert "".join(part.log for part in told) == "end\n"
-        assert told[-1].job == one.job
-        assert watch.finished
-        assert await watch.next(WAIT_S) is None
-        late = await one.hub.watch("one")
-        assert await change(late) == JobChange(one.job, "begin\nend\n", 10)
-        assert await late.next(WAIT_S) is None
-
-    run(work())
+async def test_a_watch_ends_after_the_final_state_and_the_last_line(one):
+    one.log_path.write_text("begin\n")
+    watch = await one.hub.watch("one")
+    assert await change(watch) == JobChange(one.job, "begin\n", 6)
+    assert not watch.finished
+    one.log_path.write_text("begin\nend\n")
+    one.move(state=JobState.SUCCEEDED)
+    told = [await change(watch)]
+    if told[0].job is None:  # the line was read before the state
+        told.append(await change(watch))
+    assert "".join(part.log for part in told) == "end\n"
+    assert told[-1].job == one.job
+    assert watch.finished
+    assert await watch.next(WAIT_S) is None
+    late = await one.hub.watch("one")
+    assert await change(late) == JobChange(one.job, "begin\nend\n", 10)
+    assert await late.next(WAIT_S) is None
 
 
-def test_a_watcher_who_reads_slowly_gets_the_newest_state(one):
-    async def work():
-        watch = await one.hub.watch("one")
-        await change(watch)
-        for step in range(5):
-            one.move(progress=Progress(step=step))
-        found = await change(watch)
-        assert found.job.progress.step == 4
-        assert await watch.next(2 * INTERVAL_S) == JobChange(None, "", 0)
-
-    run(work())
+async def test_a_watcher_who_reads_slowly_gets_the_newest_state(one):
+    watch = await one.hub.watch("one")
+    await change(watch)
+    for step in range(5):
+        one.move(progress=Progress(step=step))
+    found = await change(watch)
+    assert found.job.progress.step == 4
+    assert await watch.next(2 * INTERVAL_S) == JobChange(None, "", 0)
 
 
-def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one):
-    async def work():
-        with pytest.raises(JobNotFound):
-            await one.hub.watch("two")
-        watch = await one.hub.watch("one")
-        await change(watch)
-        one.error = OSError("the database has gone")
-        with pytest.raises(OSError, match="gone"):
-            await watch.next(WAIT_S)
-
-    run(work())
+async def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one):
+    with pytest.raises(JobNotFound):
+        await one.hub.watch("two")
+    watch = await one.hub.watch("one")
+    await change(watch)
+    one.error = OSError("the database has gone")
+    with pytest.raises(OSError, match="gone"):
+        await watch.next(WAIT_S)
 
 
-def test_a_closed_hub_ends_every_watch(one):
-    async def work():
-        watch = await one.hub.watch("one")
-        await change(watch)
-        one.hub.closing.set()
-        assert await watch.next(WAIT_S) is None
-        assert not watch.finished
-        late = await one.hub.watch("one")
-        assert await late.next(WAIT_S) is None
-
-    run(work())
+async def test_a_closed_hub_ends_every_watch(one):
+    watch = await one.hub.watch("one")
+    await change(watch)
+    one.hub.closing.set()
+    assert await watch.next(WAIT_S) is None
+    assert not watch.finished
+    late = await one.hub.watch("one")
+    assert await late.next(WAIT_S) is None
 
 
 def test_a_log_is_told_in_whole_lines(tmp_path):
@@ -199,19 +180,16 @@ def test_a_log_is_told_from_a_given_byte_and_a_line_without_end_in_pieces(tmp_pa
     assert read_whole(log) == "x" * 200_000 + "\nafter\n"
 
 
-def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one):
-    async def work():
-        lines = "".join(f"line {number:06d}\n" for number in range(20_000))
-        one.log_path.write_text(lines)
-        one.move(state=JobState.SUCCEEDED)
-        watch = await one.hub.watch("one", 0)
-        told = []
-        while (found := await watch.next(WAIT_S)) is not None:
-            told.append(found)
-        assert "".join(part.log for part in told) == lines
-        assert [part.job for part in told] == [None] * (len(told) - 1) + [one.job]
-
-    run(work())
+async def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one):
+    lines = "".join(f"line {number:06d}\n" for number in range(20_000))
+    one.log_path.write_text(lines)
+    one.move(state=JobState.SUCCEEDED)
+    watch = await one.hub.watch("one", 0)
+    told = []
+    while (found := await watch.next(WAIT_S)) is not None:
+        told.append(found)
+    assert "".join(part.log for part in told) == lines
+    assert [part.job for part in told] == [None] * (len(told) - 1) + [one.job]
 
 
 def read_whole(log):

@@ -61,7 +61,6 @@ from ultragray_workers.errors import QueueFull, SceneNotFound
 from ultragray_workers.pool.messages import RenderResult
 from ultragray_workers.scenes import SceneStore
 
-from ...waiting import SkippingLoop
 from .conftest import FAN, random_pose
 
 IMAGE = np.arange(12, dtype=np.uint8).reshape(1, 3, 4)
@@ -380,17 +379,17 @@ def chooser(folder, *names, default=None):
     return SceneChooser(SceneCatalog(SceneStore(folder)), default)
 
 
-def test_the_device_chooses_else_the_default_else_the_only_one(tmp_path):
+async def test_the_device_chooses_else_the_default_else_the_only_one(tmp_path):
     async def choices(one, *devices):
         return [await one.choose(device) for device in devices]
 
     only = chooser(tmp_path, "liver")
-    assert asyncio.run(choices(only, "ProbeToReference", "liver")) == ["liver", "liver"]
+    assert await choices(only, "ProbeToReference", "liver") == ["liver", "liver"]
     several = chooser(tmp_path, "spine", default="spine")
     devices = ("ProbeToReference", "liver", "ProbeToliver", "Liver")
-    assert asyncio.run(choices(several, *devices)) == ["spine", "liver", "liver", "spine"]
+    assert await choices(several, *devices) == ["spine", "liver", "liver", "spine"]
     with pytest.raises(SceneNotFound, match="ULTRAGRAY_IGTL_SCENE"):
-        asyncio.run(choices(chooser(tmp_path), "ProbeToReference"))
+        await chooser(tmp_path).choose("ProbeToReference")
 
 
 SETUP = Setup(FrameSettings())
@@ -423,100 +422,79 @@ async def taken(waiting):
     return waiting.take()
 
 
-def with_poses(work):
-    async def main():
-        await work(WaitingPoses())
-
-    asyncio.run(main())
-
-
-def test_each_device_has_its_turn_with_its_newest_pose():
-    async def work(waiting):
-        replaced = [
-            waiting.put(posed(name, x_mm), 0.0, SETUP) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))
-        ]
-        assert replaced == [False, False, True, True]
-        first, second = (await taken(waiting)).posed, (await taken(waiting)).posed
-        assert (first.message.device_name, first.pose[0, 3], first.replaced) == ("a", 4, 2)
-        assert (second.message.device_name, second.pose[0, 3], second.replaced) == ("b", 2, 0)
-
-    with_poses(work)
+async def test_each_device_has_its_turn_with_its_newest_pose():
+    waiting = WaitingPoses()
+    replaced = [waiting.put(posed(name, x_mm), 0.0, SETUP) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))]
+    assert replaced == [False, False, True, True]
+    first, second = (await taken(waiting)).posed, (await taken(waiting)).posed
+    assert (first.message.device_name, first.pose[0, 3], first.replaced) == ("a", 4, 2)
+    assert (second.message.device_name, second.pose[0, 3], second.replaced) == ("b", 2, 0)
 
 
-def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool():
-    async def work(waiting):
-        waiting.put(posed("a", 1), 0.0, SETUP)
-        underway = await taken(waiting)
-        assert not waiting.put(posed("a", 2), 0.0, SETUP)  # it is being rendered
-        turn = waits_in_the_pool(underway)
-        assert waiting.put(posed("a", 3), 0.0, SETUP)  # of the two that wait here, the older one
-        assert turn.poses is None
-        underway = await taken(waiting)
-        assert underway.posed.pose[0, 3] == 3
-        turn = waits_in_the_pool(underway)
-        assert not waiting.put(posed("b", 4), 0.0, SETUP)
-        assert waiting.put(posed("a", 5), 0.0, SETUP)
-        assert turn.poses[0, 0, 3] == 5
-        assert (underway.posed.pose[0, 3], underway.posed.replaced) == (5, 2)
-
-    with_poses(work)
+async def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool():
+    waiting = WaitingPoses()
+    waiting.put(posed("a", 1), 0.0, SETUP)
+    underway = await taken(waiting)
+    assert not waiting.put(posed("a", 2), 0.0, SETUP)  # it is being rendered
+    turn = waits_in_the_pool(underway)
+    assert waiting.put(posed("a", 3), 0.0, SETUP)  # of the two that wait here, the older one
+    assert turn.poses is None
+    underway = await taken(waiting)
+    assert underway.posed.pose[0, 3] == 3
+    turn = waits_in_the_pool(underway)
+    assert not waiting.put(posed("b", 4), 0.0, SETUP)
+    assert waiting.put(posed("a", 5), 0.0, SETUP)
+    assert turn.poses[0, 0, 3] == 5
+    assert (underway.posed.pose[0, 3], underway.posed.replaced) == (5, 2)
 
 
-def test_a_pose_does_not_take_the_turn_of_one_with_another_setup():
-    async def work(waiting):
-        waiting.put(posed("a", 1), 0.0, SETUP)
-        underway = await taken(waiting)
-        turn = waits_in_the_pool(underway)
-        waiting.again(posed("a", 1))  # a tool has moved
-        waiting.again(posed("a", 1))
-        assert waiting.put(posed("a", 2), 0.0, Setup(FrameSettings()))
-        assert turn.poses is None
-        underway = await taken(waiting)
-        assert underway.posed.pose[0, 3] == 2
-        turn = waits_in_the_pool(underway)
-        assert not waiting.put(posed("a", 3), 0.0, Setup(FrameSettings()))
-        assert turn.poses is None
-
-    with_poses(work)
+async def test_a_pose_does_not_take_the_turn_of_one_with_another_setup():
+    waiting = WaitingPoses()
+    waiting.put(posed("a", 1), 0.0, SETUP)
+    underway = await taken(waiting)
+    turn = waits_in_the_pool(underway)
+    waiting.again(posed("a", 1))  # a tool has moved
+    waiting.again(posed("a", 1))
+    assert waiting.put(posed("a", 2), 0.0, Setup(FrameSettings()))
+    assert turn.poses is None
+    underway = await taken(waiting)
+    assert underway.posed.pose[0, 3] == 2
+    turn = waits_in_the_pool(underway)
+    assert not waiting.put(posed("a", 3), 0.0, Setup(FrameSettings()))
+    assert turn.poses is None
 
 
-def test_a_pose_that_takes_a_turn_is_led_as_the_one_before():
-    async def work(waiting):
-        waiting.put(posed("a", 1), 0.0, SETUP)
-        underway = await taken(waiting)
-        turn = waits_in_the_pool(underway)
-        underway.registration = Registration(base_to_scene=rows(posed("a", 10).pose))
-        assert underway.pose[0, 3] == 11
-        assert waiting.put(posed("a", 5), 0.0, SETUP)
-        assert turn.poses[0, 0, 3] == 15
-
-    with_poses(work)
+async def test_a_pose_that_takes_a_turn_is_led_as_the_one_before():
+    waiting = WaitingPoses()
+    waiting.put(posed("a", 1), 0.0, SETUP)
+    underway = await taken(waiting)
+    turn = waits_in_the_pool(underway)
+    underway.registration = Registration(base_to_scene=rows(posed("a", 10).pose))
+    assert underway.pose[0, 3] == 11
+    assert waiting.put(posed("a", 5), 0.0, SETUP)
+    assert turn.poses[0, 0, 3] == 15
 
 
-def test_devices_without_end_are_refused():
-    async def work(waiting):
-        for number in range(MAX_WAITING_DEVICES):
-            waiting.put(posed(str(number)), 0.0, SETUP)
-        assert waiting.put(posed("0"), 0.0, SETUP)
-        with pytest.raises(QueueFull, match="16 devices"):
-            waiting.put(posed("one more"), 0.0, SETUP)
-
-    with_poses(work)
+async def test_devices_without_end_are_refused():
+    waiting = WaitingPoses()
+    for number in range(MAX_WAITING_DEVICES):
+        waiting.put(posed(str(number)), 0.0, SETUP)
+    assert waiting.put(posed("0"), 0.0, SETUP)
+    with pytest.raises(QueueFull, match="16 devices"):
+        waiting.put(posed("one more"), 0.0, SETUP)
 
 
-def test_settled_is_when_nothing_waits_and_nothing_is_under_way():
-    async def work(waiting):
-        await waiting.settled()
-        waiting.put(posed("a"), 0.0, SETUP)
-        await taken(waiting)
-        settled = asyncio.ensure_future(waiting.settled())
-        await asyncio.sleep(0)
-        assert not settled.done()
-        more = asyncio.ensure_future(taken(waiting))
-        await settled
-        more.cancel()
-
-    with_poses(work)
+async def test_settled_is_when_nothing_waits_and_nothing_is_under_way():
+    waiting = WaitingPoses()
+    await waiting.settled()
+    waiting.put(posed("a"), 0.0, SETUP)
+    await taken(waiting)
+    settled = asyncio.ensure_future(waiting.settled())
+    await asyncio.sleep(0)
+    assert not settled.done()
+    more = asyncio.ensure_future(taken(waiting))
+    await settled
+    more.cancel()
 
 
 class _FrameOf:
@@ -529,25 +507,19 @@ class _FrameOf:
         return Message(kind, "robot", version=version)
 
 
-def test_a_subscriber_is_told_at_most_as_often_as_it_asks(monkeypatch):
-    loop = SkippingLoop()
-    monkeypatch.setattr("ultragray_service.igtl.frames.time.monotonic", loop.time)
+async def test_a_subscriber_is_told_at_most_as_often_as_it_asks(clock):
     told = []
 
     async def send(message):
-        told.append(loop.time())
+        told.append(clock.now)
 
-    async def work():
-        feed = Feed(contextlib.nullcontext, send)
-        feed.start("QTDATA", "", 0.3, 1)
-        running = asyncio.ensure_future(feed.run())
-        for _ in range(100):
-            feed.offer(_FrameOf(), is_own=True)
-            await asyncio.sleep(0.01)
-        feed.stop("QTDATA")
-        await asyncio.sleep(1.0)
-        running.cancel()
-
-    loop.run_until_complete(work())
-    loop.close()
+    feed = Feed(contextlib.nullcontext, send)
+    feed.start("QTDATA", "", 0.3, 1)
+    running = asyncio.ensure_future(feed.run())
+    for _ in range(100):
+        feed.offer(_FrameOf(), is_own=True)
+        await asyncio.sleep(0.01)
+    feed.stop("QTDATA")
+    await asyncio.sleep(1.0)
+    running.cancel()
     assert told == pytest.approx([1000.0, 1000.3, 1000.6, 1000.9], abs=0.02)

@@ -52,12 +52,9 @@ def names(tmp_path):
     return sorted(path.name for path in (tmp_path / "views").iterdir())
 
 
-def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path, wanted):
-    async def ask():
-        made = views(tmp_path)
-        return await asyncio.gather(*(made.path("key", **wanted) for _ in range(3)))
-
-    found = asyncio.run(ask())
+async def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path, wanted):
+    made = views(tmp_path)
+    found = await asyncio.gather(*(made.path("key", **wanted) for _ in range(3)))
     assert set(found) == {tmp_path / "views" / "key"}
     poses = json.loads((found[0] / "poses.json").read_text())
     np.testing.assert_allclose(np.reshape(poses["val"], (-1, 4, 4)), DATASET.val.poses, atol=1e-9)
@@ -73,17 +70,13 @@ def aged(tmp_path, name, age_s, size_bytes=0):
 
 
 @pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
-def test_the_folder_not_asked_for_the_longest_goes(tmp_path, wanted, monkeypatch, kept_folders, size_bytes):
+async def test_the_folder_not_asked_for_the_longest_goes(tmp_path, wanted, monkeypatch, kept_folders, size_bytes):
     monkeypatch.setattr(prepared, "KEPT_FOLDERS", kept_folders)
     aged(tmp_path, "old", 300, size_bytes)
     aged(tmp_path, "older-but-used", 200, size_bytes)
-
-    async def ask():
-        made = views(tmp_path, max_dataset_bytes=1024)
-        assert (await made.prepare("older-but-used", **wanted)).state == "ready"
-        await made.path("key", **wanted)
-
-    asyncio.run(ask())
+    made = views(tmp_path, max_dataset_bytes=1024)
+    assert (await made.prepare("older-but-used", **wanted)).state == "ready"
+    await made.path("key", **wanted)
     assert names(tmp_path) == ["key", "older-but-used"]
 
 
@@ -101,50 +94,41 @@ def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(tmp_path, wa
     assert names(tmp_path) == ["key"]
 
 
-def test_what_fails_says_why_and_is_tried_again_later(tmp_path, wanted, monkeypatch):
-    async def ask():
-        made = views(tmp_path)
-        with monkeypatch.context() as slow:
-            slow.setattr(prepared, "TIMEOUT_S", 0.0)
-            with pytest.raises(DeadlineExceeded):
-                await made.path("key", **wanted)
-        failed = await made.prepare("key", **wanted)
-        assert failed.state == "failed"
-        assert isinstance(failed.error, DeadlineExceeded)
+async def test_what_fails_says_why_and_is_tried_again_later(tmp_path, wanted, monkeypatch):
+    made = views(tmp_path)
+    with monkeypatch.context() as slow:
+        slow.setattr(prepared, "TIMEOUT_S", 0.0)
         with pytest.raises(DeadlineExceeded):
             await made.path("key", **wanted)
-        monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
-        assert (await made.prepare("key", **wanted)).state == "running"
+    failed = await made.prepare("key", **wanted)
+    assert failed.state == "failed"
+    assert isinstance(failed.error, DeadlineExceeded)
+    with pytest.raises(DeadlineExceeded):
         await made.path("key", **wanted)
-
-    asyncio.run(ask())
+    monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
+    assert (await made.prepare("key", **wanted)).state == "running"
+    await made.path("key", **wanted)
     assert names(tmp_path) == ["key"]
 
 
-def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path, wanted):
-    async def ask():
-        made = views(tmp_path)
-        with pytest.raises(DatasetNotFound):
-            await made.path("key", dataset="gone")
-        await made.path("key", **wanted)
-
-    asyncio.run(ask())
+async def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path, wanted):
+    made = views(tmp_path)
+    with pytest.raises(DatasetNotFound):
+        await made.path("key", dataset="gone")
+    await made.path("key", **wanted)
 
 
-def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path, wanted):
-    async def ask():
-        made = views(tmp_path)
-        with Hold("lay_out") as held:
-            asking = asyncio.ensure_future(made.path("job-1", **wanted))
-            while held.pid is None:
-                await asyncio.sleep(0.01)
-            await made.settled(lambda key: key.startswith("other-"))
-            assert not (tmp_path / "views" / "job-1").exists()
-        await made.settled(lambda key: key.startswith("job-"))
-        assert (tmp_path / "views" / "job-1").exists()
-        await asking
-
-    asyncio.run(ask())
+async def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path, wanted):
+    made = views(tmp_path)
+    with Hold("lay_out") as held:
+        asking = asyncio.ensure_future(made.path("job-1", **wanted))
+        while held.pid is None:
+            await asyncio.sleep(0.01)
+        await made.settled(lambda key: key.startswith("other-"))
+        assert not (tmp_path / "views" / "job-1").exists()
+    await made.settled(lambda key: key.startswith("job-"))
+    assert (tmp_path / "views" / "job-1").exists()
+    await asking
 
 
 async def end_of(made, wanted):
@@ -210,7 +194,7 @@ def test_what_dead_services_left_is_removed(tmp_path, monkeypatch):
     assert names(tmp_path) == [".making-alive", "kept"]
 
 
-def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
+async def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
     started = []
     start = threads.subprocess.Popen
 
@@ -220,11 +204,7 @@ def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
         return started[-1]
 
     monkeypatch.setattr(threads.subprocess, "Popen", watched)
-
-    async def ask():
-        processes = HelperProcesses(4 << 30)
-        made, others = (views(tmp_path, kind, processes) for kind in (Views, Others))
-        await asyncio.gather(*(each.path(key, **wanted) for each in (made, others) for key in ("a", "b")))
-
-    asyncio.run(ask())
+    processes = HelperProcesses(4 << 30)
+    made, others = (views(tmp_path, kind, processes) for kind in (Views, Others))
+    await asyncio.gather(*(each.path(key, **wanted) for each in (made, others) for key in ("a", "b")))
     assert len(started) == 4
