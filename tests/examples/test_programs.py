@@ -201,9 +201,7 @@ def test_it_comes_nearer_to_the_plane(plane):
     ],
 )
 def test_as_a_program(demo_service, example, options, told):
-    if example == "mujoco_scan":
-        pytest.importorskip("mujoco", reason="what no test installs")
-    address = [] if example in ("standard_plane", "scan_policy", "mujoco_scan") else ["--address", demo_service.grpc]
+    address = [] if example in ("standard_plane", "scan_policy") else ["--address", demo_service.grpc]
     command = [sys.executable, EXAMPLES / f"{example}.py", *address, *options.split()]
     printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout
     assert [words for words in told if words not in printed] == []

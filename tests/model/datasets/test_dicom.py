@@ -6,11 +6,10 @@ from functools import partial
 
 import cv2
 import numpy as np
-import pydicom
 import pytest
 from pydicom.encaps import encapsulate
 from pydicom.pixels.decoders.base import Decoder
-from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1, RLELossless
+from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets import dicom
@@ -53,14 +52,6 @@ def test_poses_in_json_and_a_scale_without_regions(write, tmp_path):
         "no region in centimetres: the whole image of 32 x 24 pixels is taken as ultrasound",
         "the file does not name its transducer: taken as a linear one",
     )
-
-
-def test_compressed_frames_are_read_where_there_is_a_decoder(write):
-    path = write()
-    data = pydicom.dcmread(path)
-    data.compress(RLELossless)
-    data.save_as(path)
-    np.testing.assert_array_equal(load_dataset(path).val.images, FRAMES[[2, 7], 2:22, 4:24])
 
 
 def test_the_fan_of_a_convex_probe_becomes_scan_lines(write):

@@ -93,24 +93,18 @@ def test_the_calibration_may_be_in_the_sequence(tmp_path, plus_files, device_set
 
 
 @pytest.mark.parametrize("suffix", ["igs.mha", "seq.nrrd"])
-@pytest.mark.parametrize("orientation", ["MN", "FM", "NMA", "UF"])
-def test_stored_orientations_give_the_same_sweep(tmp_path, plus_files, device_set, orientation, suffix):
+def test_a_stored_orientation_gives_the_same_sweep(tmp_path, plus_files, device_set, suffix):
     frames, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     expected, _ = read_plus_sweep(
         plus_files.write_mha(tmp_path / "mf.mha", frames, fields), device_set=device_set, crop="2:12,3:23"
     )
-    stored = {
-        "MN": frames[:, ::-1],
-        "FM": frames.swapaxes(1, 2),
-        "NMA": frames.swapaxes(1, 2)[:, :, ::-1],
-        "UF": frames[:, :, ::-1],
-    }[orientation]
+    stored = np.ascontiguousarray(frames.swapaxes(1, 2)[:, :, ::-1])
     write, key = (
         (plus_files.write_mha, "UltrasoundImageOrientation")
         if suffix == "igs.mha"
         else (plus_files.write_nrrd, "ultrasound image orientation")
     )
-    path = write(tmp_path / f"s.{suffix}", np.ascontiguousarray(stored), {key: orientation, **fields})
+    path = write(tmp_path / f"s.{suffix}", stored, {key: "NMA", **fields})
     sweep, _ = read_plus_sweep(path, device_set=device_set, crop="2:12,3:23")
     np.testing.assert_array_equal(sweep.images, expected.images)
     np.testing.assert_array_equal(sweep.poses, expected.poses)

@@ -160,7 +160,7 @@ def test_health_lists_every_service_without_a_key(guarded):
             statuses = stub.List(health_pb2.HealthListRequest(), timeout=300).statuses
             return bool(statuses[name].status == health_pb2.HealthCheckResponse.SERVING)
 
-        for name in ("", "ultragray.v1.RenderService"):
+        for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
             wait_until(partial(is_serving, name))  # it follows the service a moment later
         check = channel.unary_unary("/grpc.health.v1.Health/Check")
         with pytest.raises(grpc.RpcError) as caught:

@@ -7,7 +7,6 @@ import grpc
 import httpx
 import pytest
 from google.protobuf.empty_pb2 import Empty
-from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2
@@ -16,20 +15,10 @@ from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import DeadlineExceeded
 
-from ...waiting import wait_until
 from .test_grpc_render import error_info
 
 
-def test_health_and_reflection(channel):
-    health = health_pb2_grpc.HealthStub(channel)
-    for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
-        request = health_pb2.HealthCheckRequest(service=name)
-
-        def is_serving(request=request):
-            status = health.Check(request, timeout=300).status
-            return bool(status == health_pb2.HealthCheckResponse.SERVING)
-
-        wait_until(is_serving)
+def test_reflection(channel):
     reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
     request = reflection_pb2.ServerReflectionRequest(list_services="*")
     (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=300)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from ultragray.errors import InvalidArgument, TrainingStateInvalid
+from ultragray.errors import TrainingStateInvalid
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.checkpointing import (
     FORMAT_VERSION,
@@ -81,12 +80,6 @@ def test_a_resumed_run_hides_the_steps_that_it_takes_again(tmp_path):
     write(tmp_path, {1: 0.5, 2: 0.25, 3: 0.125}, steps_done=0)
     write(tmp_path, {2: 0.75, 3: 0.625}, steps_done=1)
     assert shown(tmp_path, "loss") == [(1, 0.5), (2, 0.75), (3, 0.625)]
-
-
-def test_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(InvalidArgument, match=r"tensorboardX is not installed: .*'ultragray\[tensorboard\]'"):
-        Board(tmp_path, steps_done=0)
 
 
 HEADER = CheckpointHeader(
