@@ -15,7 +15,6 @@ from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 
 SIDE = 128
 FIRST_MM = -36.0  # where the sweeps begin
-CAUSES = ("tilt", "steep", "gap", "end", "band", "random")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +23,7 @@ class Asked:
 
     training: Sweep
     unseen: Sweep
-    causes: np.ndarray  # [F] of CAUSES
+    causes: np.ndarray  # [F] of tilt, steep, gap, end, band, random
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,6 @@ CLIENT_GROUPS = (
     "ultragray_client.client.Registrations",
 )
 _ONLY = {"ultragray.contract": ("from_dict", "to_dict")}
-_OWN = ("ultragray", "ultragray_client")
 
 _HEADING = re.compile(r"\[bold\]")
 

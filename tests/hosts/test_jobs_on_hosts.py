@@ -1,11 +1,11 @@
 """Datasets and jobs of several hosts over a bucket: each host sees all of them, and a job goes on elsewhere."""
 
-import io
 import json
+import shutil
 import subprocess
 import time
-import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import httpx
 import pytest
@@ -105,12 +105,7 @@ SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
 def released(folder):
     """The tiny dataset as an archive."""
     write_released(tiny_dataset(), folder)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                archive.write(path, path.relative_to(folder))
-    return packed.getvalue()
+    return Path(shutil.make_archive(str(folder), "zip", folder)).read_bytes()
 
 
 def put_dataset(http, content):

@@ -13,6 +13,7 @@ import typer
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.poses import load_poses
+from ultragray.files import npy_bytes, write_whole
 from ultragray.learn.localization.pixels import read_frame
 from ultragray.learn.localization.settings import SearchKind
 from ultragray.scene.info import read_header
@@ -82,23 +83,11 @@ def localize(
             loaded, pixels, about, within_mm=within_mm, within_deg=within_deg, search=search, backend=backend
         )
     if output is not None and found.is_found:
-        _write_pose(output, found)
+        write_whole(output, npy_bytes(found.pose))
     document = asdict(found) | {"pose": found.pose.tolist()}
     tell(_in_words(found, output), document, as_json=json)
     if not found.is_found:
         raise typer.Exit(1)
-
-
-def _write_pose(path: Path, found: Localization) -> None:
-    import io
-
-    import numpy as np
-
-    from ultragray.files import write_whole
-
-    data = io.BytesIO()
-    np.save(data, found.pose)
-    write_whole(path, data.getvalue())
 
 
 def _in_words(found: Localization, output: Path | None) -> str:

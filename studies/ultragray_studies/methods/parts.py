@@ -37,11 +37,6 @@ class Box:
         """By which a cube around the box is scaled to [-1, 1], so that no axis is stretched."""
         return float(self.half_mm.max())
 
-    def normalised(self, points_mm: FloatArray) -> FloatArray:  # [..., 3] -> [..., 3]
-        """Points in the cube of side 2 around the box."""
-        found: FloatArray = (points_mm - self.centre_mm) / self.largest_half_mm
-        return found
-
 
 def pixel_points_mm(probe: Probe, pose: FloatArray, height: int, width: int) -> FloatArray:  # [H, W, 3]
     """The place of each pixel in the tracker's frame, mm, of a frame at a pose [4, 4]."""

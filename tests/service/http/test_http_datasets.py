@@ -14,6 +14,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
+from ultragray.files import npy_bytes
 from ultragray_service.core.uploads import MAX_UPLOADS
 from ultragray_workers.claims import LOCK_NAME
 
@@ -43,9 +44,7 @@ def released_files(folder, seed=0):
 def poisoned_files(files):
     poses = np.load(io.BytesIO(files["poses_train.npy"]))
     poses[5, 0, 0] = np.nan
-    changed = io.BytesIO()
-    np.save(changed, poses)
-    return {**files, "poses_train.npy": changed.getvalue()}
+    return {**files, "poses_train.npy": npy_bytes(poses)}
 
 
 def zipped(files):

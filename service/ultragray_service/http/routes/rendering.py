@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import json
 from dataclasses import fields
 from functools import lru_cache
@@ -17,6 +16,7 @@ from starlette.responses import Response
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
+from ultragray.files import npy_bytes
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.volumes import SliceSettings, SliceView
@@ -211,9 +211,7 @@ async def render_slice(request: Request, service: ServiceDep, scene: SceneName) 
 def _npy_of(result: RenderResult[SliceView]) -> bytes:
     view = result.settings
     pixels = np.frombuffer(result.data, view.encoding.pixel_type).reshape(view.height, view.width)
-    file = io.BytesIO()
-    np.save(file, pixels)
-    return file.getvalue()
+    return npy_bytes(pixels)
 
 
 def _headers(facts: SliceFacts) -> dict[str, str]:
