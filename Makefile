@@ -109,6 +109,7 @@ test-image: $(VENV)/installed-dev  ## build the image with neither engine nor re
 
 test-shards: $(VENV)/installed-dev  ## a batch of FRAMES (100000) in 200 shards: workers killed at random, Ray beside them (RECORD=1: into the documents)
 	$(READY)
+	@$(PIP_INSTALL) 'ultragray[ray]'
 	ULTRAGRAY_SHARDS_FRAMES=$(FRAMES) ULTRAGRAY_SHARDS_RECORD=$(FIGURES)/shards.json $(BIN)/pytest -m long tests/batches $(ARGS)
 	$(KEEP) shards
 

@@ -45,6 +45,8 @@ from .newest import NewestFrames
 
 API_KEY = "ULTRAGRAY_API_KEY"  # parameters are read by everybody on the network, the environment is not
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # fits publishers of either reliability
+# Nobody asks again, and best effort loses what comes before the node knows its publisher.
+ASKED_ONCE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 CHECK_TIMEOUT_S = 2.0
 LOOK_EVERY_S = 1.0  # whether the node was told to stop: what rclpy wakes it by on a signal is lost now and then
 OWN_PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -125,7 +127,7 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         try:
             self._record()
             self._take_poses()
-            self._plan_subscription = self.create_subscription(PoseStamped, "~/plan_from", self._plan, NEWEST)
+            self._plan_subscription = self.create_subscription(PoseStamped, "~/plan_from", self._plan, ASKED_ONCE)
         except ClientError as error:
             self.get_logger().error(str(error))
             self._stop()

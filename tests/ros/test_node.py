@@ -77,7 +77,7 @@ def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
 
 def test_a_plan_is_published_for_whoever_asks_where_to_look_next(start_node, peer, ros_service):
     from geometry_msgs.msg import PoseArray, PoseStamped
-    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
     from std_msgs.msg import String
 
     start_node(**{"address": ros_service.grpc, "plan.views": 3, "plan.within_mm": 0.5, "plan.tilt_deg": 20.0})
@@ -87,6 +87,8 @@ def test_a_plan_is_published_for_whoever_asks_where_to_look_next(start_node, pee
     start = PoseStamped()
     start.header.frame_id, start.header.stamp.sec, start.pose.orientation.w = "scene", 7, 1.0
     wait_until(asking.get_subscription_count)
+    listening = peer.node.get_subscriptions_info_by_topic("/ultragray/plan_from")
+    assert {one.qos_profile.reliability for one in listening} == {ReliabilityPolicy.RELIABLE}, "a question may be lost"
     asking.publish(start)
     plan = wait_until(lambda: plans and plans[-1])
     with Client(ros_service.grpc) as client:
