@@ -219,6 +219,23 @@ def test_hard_is_where_neighbours_do_not_tell(side):
     assert hardness[:9].max() < -1.0 < 1.0 < hardness[15:].min()
 
 
+def test_a_gap_is_hard_where_its_edges_differ():
+    """A texture that drifts sideways, evenly but for a gap of 8 mm; behind that either the same one or another."""
+    textures = np.random.default_rng(1).integers(0, 255, (2, 8, 15))
+    alike, different = (np.kron(textures[[0, other]], np.ones((8, 16), int)).astype(np.uint8) for other in (0, 1))
+    poses = np.tile(np.eye(4), (16, 1, 1))
+    poses[:, 1, 3] = np.arange(16) + np.repeat([0.0, 7.0], 8)
+    found = []
+    for texture in (alike, different):
+        images = np.stack(
+            [np.roll(texture[place // 8], round(y), axis=1)[:, :64] for place, y in enumerate(poses[:, 1, 3])]
+        )
+        found.append(hardness_of_views(Sweep(images, poses, PROBE, np.arange(16), "test")))
+    of_alike, of_different = found
+    assert of_different[[7, 8]].min() > of_alike[[7, 8]].max() + 0.5
+    assert of_different[[7, 8]].min() > of_different[[2, 13]].max() + 0.5
+
+
 def sweep_at(poses):
     images = np.random.default_rng(0).integers(0, 255, (len(poses), 4, 4)).astype(np.uint8)
     return Sweep(images, poses, PROBE, np.arange(len(poses)), "test")
