@@ -428,7 +428,7 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 
     def block(place: re.Match[str]) -> str:
         one = BLOCKS[place[1]]
-        if not (figures := read_kept(one.source)):
+        if not ((figures := read_kept(one.source)) and one.part(figures)):
             return f"{place[1]}{place[2]}Not measured yet: `make {TARGETS[one.source]} RECORD=1`.\n"
         lines = [*one.of(figures), ""]
         lines[-2] = f"`{kept(one.source).relative_to(measuring.ROOT)}`: {lines[-2]}"
@@ -440,8 +440,10 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 def show(target: str) -> None:
     """Print the tables of what a target measured."""
     for name, one in BLOCKS.items():
-        if TARGETS[one.source] == target and (found := read(staged(one.source))):
-            sys.stdout.write("\n".join((f"# {name}", "", *one.of(_beside_kept(one.source, found)), "", "")))
+        if TARGETS[one.source] != target or not (found := read(staged(one.source))):
+            continue
+        if one.part(found := _beside_kept(one.source, found)):
+            sys.stdout.write("\n".join((f"# {name}", "", *one.of(found), "", "")))
 
 
 def listing() -> Iterator[str]:
