@@ -7,8 +7,8 @@ not see, some that it did, frames extrapolated from one side of the sweep, and a
 decides what a scene's own frames leave open. The least squares are solved by Levenberg-Marquardt steps with w ≥ 0 but
 for its first entry. `fit_uncertainty` explains squared errors of pixels by the same distances.
 
-In reading order: which frames are held out, predictions of frames from others, hardness, the fit of the weights,
-one-sided examples, uncertainty, and `fit_confidence`, which calls all of them.
+In reading order: which frames are held out, predictions of frames from one side, hardness, the fit of the weights,
+uncertainty, and `fit_confidence`, which calls all of them.
 """
 
 from __future__ import annotations
@@ -155,17 +155,20 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
     return torch.stack(pooled).round().to(torch.uint8).numpy()
 
 
-def one_sided(sweep: Sweep, most: int, beyond_mm: Sequence[float]) -> list[Prediction]:
-    """At most `most` frames of a sweep, each extrapolated from those before it and from those behind it.
+MOST_TARGETS = 192  # frames that are predicted
+BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
 
-    Of these only frames farther away along the path are used than each of `beyond_mm`, 0 the first of them. A sweep of
-    one or two frames has none.
+
+def one_sided(sweep: Sweep) -> list[Prediction]:
+    """Some frames of a sweep, each extrapolated from those before it and from those behind it, ever farther away.
+
+    A sweep of one or two frames has none.
     """
-    neighbours, path = Neighbours(sweep, most), path_mm(sweep)
+    neighbours, path = Neighbours(sweep, MOST_TARGETS), path_mm(sweep)
     found = []
     for row, target in enumerate(neighbours.targets):
         for ahead in (path - path[target], path[target] - path):
-            choices = (neighbours.helpers(row, ahead > beyond) for beyond in beyond_mm)
+            choices = (neighbours.helpers(row, ahead > beyond_mm) for beyond_mm in BEYOND_MM)
             found += [
                 neighbours.predict(row, helpers, is_nearest=not number)
                 for number, helpers in enumerate(dict.fromkeys(choices))
@@ -174,19 +177,17 @@ def one_sided(sweep: Sweep, most: int, beyond_mm: Sequence[float]) -> list[Predi
     return found
 
 
-MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
-NEAREST_MM = (0.0, 3.0)  # from the nearest frames, and once farther away, which tells how scores usually fall
 LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
 SMOOTHING = 0.01
 
 
-def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
+def hardness_of_views(sweep: Sweep, predictions: Sequence[Prediction]) -> FloatArray:  # [F]
     """How far the frames on either side of each frame tell less of it than is usual at such distances, in logits.
 
     A mean over both sides by the squares of their distances: where frames lie close on one side, and a gap is on the
     other that shows something else behind it, poses are asked for in the gap. It is smoothed over the views around.
+    `predictions` are the `one_sided` of the sweep.
     """
-    predictions = one_sided(sweep, MAX_FRAMES, NEAREST_MM)
     if not predictions:
         return np.zeros(len(sweep))
     distances_mm = np.array([one.measures.distance_mm.mean() for one in predictions])
@@ -282,13 +283,8 @@ def fit_weights(
     return weights[:-1]
 
 
-ONE_SIDED_FRAMES = 96  # that are predicted
-BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)
-
-
-def one_sided_examples(sweep: Sweep, hardness: FloatArray) -> Examples:
-    """Some frames of a sweep, each extrapolated from either side, ever farther away; `hardness` [F] of its frames."""
-    predictions = one_sided(sweep, ONE_SIDED_FRAMES, BEYOND_MM)
+def one_sided_examples(sweep: Sweep, predictions: Sequence[Prediction], hardness: FloatArray) -> Examples:
+    """The `one_sided` predictions of a sweep, with the `hardness` [F] of its frames."""
     if not predictions:
         return Examples(np.zeros((0, POINTS_PER_SIDE**2, 1 + TERMS)), np.zeros(0))
     targets = [one.target for one in predictions]
@@ -409,11 +405,12 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     ms_ssim, shares = _measured(scene, both, backend)
     views = TrainingViews(part.train.poses, sweep.probe)
     measures = views.measure(both.poses, sweep.probe)
-    terms = terms_of(measures, hardness_of_views(part.train))
+    terms = terms_of(measures, hardness_of_views(part.train, one_sided(part.train)))
     some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
     black = evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim  # that black frames reach
-    hardness = hardness_of_views(sweep)
-    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
+    predictions = one_sided(sweep)
+    hardness = hardness_of_views(sweep, predictions)
+    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, predictions, hardness))
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
     return ConfidenceModel(
         weights=tuple(weights.tolist()),
