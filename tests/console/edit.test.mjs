@@ -73,9 +73,14 @@ describe("edits of a scene", () => {
     await panelOf(page).getByRole("combobox", { name: "Keep" }).selectOption("outside");
     await save(page, "without-box");
     await until(() => greyAt(page, [0.5, 0.5]), (grey) => grey < 2, "the box still shows");
+    await page.route(/\/v1\/scenes\/without-box$/, async (route) => {
+      const answer = await (await route.fetch()).json();
+      const edits = answer.edits.map((edit) => JSON.stringify({ ...JSON.parse(edit), left_out: ["modes of motion"] }));
+      await route.fulfill({ json: { ...answer, edits } });
+    });
     await page.reload();
     const parents = page.getByTestId("parents");
-    await parents.getByText("· Cut").waitFor();
+    await parents.getByText("· Cut, without modes of motion").waitFor();
     assert.match(await parents.getByRole("link", { name: "demo" }).getAttribute("href"), /#\/scan\/demo\?.*pose=/);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });

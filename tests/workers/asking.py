@@ -17,8 +17,11 @@ def asking(
     deadline=None,
     caller=UNKNOWN_CALLER,
     begin_by=None,
+    destination=None,
     **settings,
 ):
     """A request; what is not given is as the scenes were trained."""
     resolved = Resolved(**{"probe": PROBE, "height": HEIGHT, "width": WIDTH, **settings})
-    return RenderRequest(scene, resolved, poses, priority, deadline, caller=caller, begin_by=begin_by)
+    return RenderRequest(
+        scene, resolved, poses, priority, deadline, caller=caller, begin_by=begin_by, destination=destination
+    )

@@ -137,6 +137,9 @@ class Moving:
                 field="motion",
             )
 
+    def is_same(self, other: Moving) -> bool:
+        return self.motion == other.motion and np.array_equal(self.coefficients, other.coefficients)
+
     def to_json(self) -> str:
         document = {
             **to_dict(self.motion),

@@ -22,7 +22,7 @@ TOKEN_BYTES = 32
 MAX_SLOTS = 64
 PAGE_BYTES = 4096
 MAX_BYTES = 256 * 2**20  # of all slots of one stream
-MAX_SLOT_BYTES = 16 * 2**20  # copied within the event loop: some milliseconds
+MAX_SLOT_BYTES = 16 * 2**20  # allocated within the event loop: some milliseconds
 
 _FIELD = "shared_memory"
 _SOCKET = ".socket"  # behind the name of the file
@@ -42,6 +42,7 @@ class SharedMemory:
             )
         _check_sizes(asked)
         self._slots, self._slot_bytes = asked.slots, asked.slot_bytes
+        self._allocated = [0] * asked.slots  # bytes of each
         self.socket: socket.socket | None = None  # for the messages of the stream
         path = f"{FOLDER}/{asked.name}"
         try:
@@ -68,24 +69,26 @@ class SharedMemory:
         if not hmac.compare_digest(os.pread(self._descriptor, TOKEN_BYTES, 0), asked.token):
             raise _refused(asked, "it does not begin with the token")
 
-    def put(self, descriptor: int, size: int) -> Place | None:
-        """Copies the first `size` bytes of a file into the first slot that is free; None where there is no room."""
+    def lend(self, size: int) -> Place | None:
+        """The first slot that is free, with memory for so many bytes; None where there is no room."""
         if size > self._slot_bytes:
             return None
         try:
             slot = os.pread(self._descriptor, self._slots, TOKEN_BYTES).find(FREE)
             if slot < 0:
                 return None
-            os.lseek(self._descriptor, HEADER_BYTES + slot * self._slot_bytes, os.SEEK_SET)
-            copied = 0
-            while copied < size:
-                if not (count := os.sendfile(self._descriptor, descriptor, copied, size - copied)):
-                    return None
-                copied += count
+            offset = HEADER_BYTES + slot * self._slot_bytes
+            if size > self._allocated[slot]:
+                os.posix_fallocate(self._descriptor, offset, size)  # fails here where /dev/shm is full
+                self._allocated[slot] = size
             os.pwrite(self._descriptor, _LENT, TOKEN_BYTES + slot)
-        except OSError:  # such as a full /dev/shm
+        except OSError:
             return None
-        return Place(slot, size)
+        return Place(slot, size, self._descriptor, offset)
+
+    def take_back(self, place: Place) -> None:
+        with suppress(OSError):
+            os.pwrite(self._descriptor, FREE, TOKEN_BYTES + place.slot)
 
     def close(self) -> None:
         """Lets go of the memory; frames that the client has stay where they are. Nothing is put there any more."""

@@ -6,7 +6,6 @@ import socket
 from pathlib import Path
 
 import grpc
-import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
@@ -14,7 +13,6 @@ from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.streams import MAX_MESSAGE_BYTES
 from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
-from ultragray_workers.pool.messages import Place
 
 from ...file_sizes import files_of_at_most
 from ...waiting import wait_until
@@ -305,16 +303,18 @@ def test_a_loopback_address_is_that_of_either_protocol(memory, peer):
     assert not memory.path.exists()
 
 
-def test_a_slot_that_cannot_be_written_is_not_taken(memory, tmp_path):
-    source = (tmp_path / "frame").open("wb+", buffering=0)
-    source.write(np.arange(8192, dtype=np.uint8).tobytes())
+def test_a_slot_that_cannot_be_written_is_not_lent(memory):
     shared = SharedMemory(memory.message, LOCAL_PEER)
+    memory.file.truncate(HEADER_BYTES)
     with files_of_at_most(HEADER_BYTES + 4096):  # like a /dev/shm that is full
-        assert shared.put(source.fileno(), 8192) is None
+        assert shared.lend(8192) is None
     assert memory.flags == b"\1\1\1"
-    assert shared.put(source.fileno(), 8192) == Place(0, 8192)
-    assert shared.put(source.fileno(), 8193) is None  # the file has less
-    assert memory.flags == b"\0\1\1"
+    first, second = shared.lend(8192), shared.lend(SLOT_BYTES)
+    assert ((first.slot, first.offset), (second.slot, second.offset)) == ((0, 4096), (1, 4096 + SLOT_BYTES))
+    assert shared.lend(SLOT_BYTES + 1) is None
+    shared.take_back(first)
+    assert memory.flags == b"\1\0\1"
     shared.close()
-    assert shared.put(source.fileno(), 8192) is None
-    source.close()
+    assert shared.lend(8192) is None
+    shared.take_back(second)
+    assert memory.flags == b"\1\0\1"

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe
-from ultragray.errors import BackendUnavailable, InvalidArgument, SceneFileInvalid
+from ultragray.errors import BackendUnavailable, FrameTooCostly, InvalidArgument, SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray.rendering.settings import Encoding
 from ultragray_workers import PoolConfig, RenderPool, SceneStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, SceneTooLarge
+from ultragray_workers.pool.messages import Place
 
 from ..asking import asking
 
@@ -93,6 +94,73 @@ async def test_a_cancelled_request_leaves_the_queue(open_pool, random_poses, unt
         await pool.render(asking("a", random_poses(1)))
         assert "b" not in pool.loaded()
     assert rendered == ["a"]
+
+
+class OneRoom:
+    """A caller's memory with room for one frame."""
+
+    def __init__(self, offset=4096):
+        self.descriptor, self.offset = os.memfd_create("caller"), offset
+        self.is_free = True
+
+    def lend(self, size):
+        if not self.is_free:
+            return None
+        self.is_free = False
+        return Place(7, size, self.descriptor, self.offset)
+
+    def take_back(self, place):
+        assert place.slot == 7
+        self.is_free = True
+
+    @property
+    def written(self):
+        return os.pread(self.descriptor, 2**20, 0)
+
+
+@pytest.fixture
+def room():
+    made = OneRoom()
+    yield made
+    os.close(made.descriptor)
+
+
+async def test_frames_are_rendered_into_the_memory_of_their_caller(open_pool, random_poses, room):
+    request = asking("a", random_poses(5), encoding=Encoding.FLOAT32, outputs=("bmode", "echo"))
+    into = replace(request, destination=room)
+    async with open_pool(max_batch_poses=2) as pool:
+        expected, there, beside = [await pool.render(one) for one in (request, into, into)]
+        floats, room.is_free = room.written, True
+        image = await pool.render(asking("a", random_poses(1), encoding=Encoding.PNG, destination=room))
+    assert (there.place.slot, there.place.size, there.data) == (7, len(expected.data), b"")
+    assert floats == bytes(room.offset) + expected.data
+    assert (beside.place, beside.data) == (None, expected.data)
+    assert image.data == b""
+    assert room.written[room.offset :][: image.place.size].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("sign", [signal.SIGCONT, signal.SIGKILL])
+async def test_the_room_of_a_frame_that_nobody_takes_is_free_when_its_process_is_done(
+    open_pool, random_poses, room, until, sign
+):
+    async with open_pool() as pool:
+        await pool.load("a")
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        task = asyncio.create_task(pool.render(asking("a", random_poses(1), destination=room)))
+        await until(lambda: pool.statistics().busy == 1)
+        task.cancel()
+        await asyncio.wait([task])
+        assert not room.is_free  # the process may still write there
+        os.kill(worker, sign)
+        await until(lambda: room.is_free)
+
+
+async def test_the_room_of_a_refused_frame_is_free_again(open_pool, random_poses, room):
+    async with open_pool(max_footprint_pixels=1) as pool:
+        with pytest.raises(FrameTooCostly):
+            await pool.render(asking("a", random_poses(1), destination=room))
+        assert room.is_free
 
 
 async def test_load_and_unload_reach_every_process(open_pool):

@@ -25,13 +25,16 @@ from ultragray_workers.pool.messages import (
     Loading,
     LoadTask,
     PackTask,
+    Place,
     PoolConfig,
     Rendered,
+    RenderRequest,
     SceneChangedError,
     Search,
     Task,
     TaskPart,
     UnloadTask,
+    reply_bytes,
 )
 from ultragray_workers.pool.processes import Launcher, Peer, Watch
 from ultragray_workers.pool.waiting import Part, Ticket, WaitingQueue
@@ -276,16 +279,23 @@ class Dispatcher:
     def discard(self, ticket: Ticket) -> None:
         """Forgets a ticket, rendered or not: drops what still waits and takes its memory back."""
         self._waiting.remove(ticket)
+        ticket.is_discarded = True
         if ticket.in_flight:
             for slot in self.slots:
                 slot.give_up_abandoned()
+        self._take_back(ticket)
+
+    def _take_back(self, ticket: Ticket) -> None:
+        """The memory of a ticket that is discarded, once no worker may write to it any more."""
+        if ticket.in_flight or not ticket.is_discarded:
+            return
+        destination, place = ticket.request.destination, ticket.hand_over()
+        if destination is not None and place is not None:
+            destination.take_back(place)
         for memory in (ticket.memory, ticket.archive):
-            if memory is None:
-                continue
-            if ticket.in_flight:  # a worker may still write to it
-                os.close(memory)
-            else:
+            if memory is not None:
                 self._memories.release(memory)
+        ticket.memory = ticket.archive = None
 
     async def close(self) -> None:
         """Returns when all worker processes are gone. Fail the tickets first."""
@@ -334,12 +344,14 @@ class Dispatcher:
         if first.packs:
             slot.assign(_pack_task(first.ticket), assignment, [self._memory(first.ticket), self._archive(first.ticket)])
         else:
-            slot.assign(_task(first.ticket, batch), assignment, [self._memory(part.ticket) for part in batch])
+            memories = [self._memory(part.ticket) for part in batch]  # first: the task tells where in them
+            slot.assign(_task(first.ticket, batch), assignment, memories)
 
     def _memory(self, ticket: Ticket) -> int:
         """The file that the frames of a ticket are written to; with it a ticket counts as begun."""
         if ticket.memory is None:
-            ticket.memory = self._memories.acquire()
+            ticket.place = _lent(ticket.request)
+            ticket.memory = self._memories.acquire() if ticket.place is None else ticket.place.descriptor
             if isinstance(ticket.request.settings, Search):
                 os.ftruncate(ticket.memory, 0)
                 write_at(ticket.memory, memoryview(ticket.request.settings.data), 0)
@@ -365,6 +377,7 @@ class Dispatcher:
         ticket = step.ticket
         ticket.in_flight -= 1
         if ticket.done.done():
+            self._take_back(ticket)
             return
         if isinstance(outcome, Rendered):
             self._advance(ticket, step, outcome)
@@ -383,6 +396,7 @@ class Dispatcher:
         for step in reversed(assignment.steps.values()):
             step.ticket.in_flight -= 1
             if step.ticket.done.done():
+                self._take_back(step.ticket)
                 continue
             if (failure := _failure(step.attempts + 1, step.kills + hung)) is not None:
                 self._fail_ticket(step.ticket, failure)
@@ -460,10 +474,23 @@ def _task(ticket: Ticket, parts: list[Part]) -> Task[Any]:
             first=part.first,
             total=len(part.ticket.request.poses),
             deadline=part.ticket.request.deadline,
+            **_where(part.ticket.place),
         )
         for part in parts
     )
     return Task(scene=ticket.request.scene, path=ticket.path, version=ticket.request.version, parts=found)
+
+
+def _where(place: Place | None) -> dict[str, int]:
+    return {} if place is None else {"offset": place.offset, "room": place.size}
+
+
+def _lent(request: RenderRequest[Any]) -> Place | None:
+    """A place for frames in the caller's own memory; None where they come through that of the pool."""
+    settings = request.settings
+    if request.destination is None or not isinstance(settings, Resolved) or settings.encoding is Encoding.NPZ:
+        return None
+    return request.destination.lend(reply_bytes(settings, len(request.poses)))
 
 
 def _sent(settings: Resolved | SliceView | Search) -> Resolved | SliceView | Search:

@@ -24,6 +24,7 @@ from ultragray_workers.pool.channel import MAX_DESCRIPTORS
 from ultragray_workers.pool.turns import UNKNOWN_CALLER, Caller
 from ultragray_workers.storage.local import FileVersion
 
+_IMAGE_HEADER_BYTES = 2**16
 MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
 
 
@@ -134,17 +135,22 @@ class Priority(IntEnum):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a destination has put data."""
+    """Room in a destination."""
 
-    slot: int
+    slot: int  # the destination's number for it
     size: int  # bytes
+    descriptor: int  # of the file
+    offset: int  # in the file, bytes
 
 
 class Destination(Protocol):
-    """Memory of a caller, which its frames are put into."""
+    """Memory of a caller, which its frames are rendered into."""
 
-    def put(self, descriptor: int, size: int) -> Place | None:
-        """Copies the first `size` bytes of a file into it; None where it has no room for them."""
+    def lend(self, size: int) -> Place | None:
+        """Room for so many bytes, which no other frame gets; None where there is none."""
+
+    def take_back(self, place: Place) -> None:
+        """Room that no frame came into, and that no process writes to any more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +168,14 @@ class RenderRequest(Generic[W]):
     version: FileVersion | None = None  # of the scene's file that the settings are for; None: any
     caller: Caller = UNKNOWN_CALLER
     begin_by: float | None = None  # time.monotonic() in seconds; it is given up where none of it has begun by then
-    destination: Destination | None = None  # of the reply; None: RenderResult.data
+    destination: Destination | None = None  # of the reply, but for an npz; None: RenderResult.data
+
+
+def reply_bytes(settings: Resolved | SliceView, poses: int) -> int:
+    """All pixels of a reply; for an image file, more than it takes. Of an archive its arrays alone."""
+    pixels = poses * len(settings.outputs) * settings.picture.height * settings.picture.width
+    size = pixels * settings.encoding.pixel_type.itemsize
+    return 2 * size + _IMAGE_HEADER_BYTES if settings.encoding.is_image_file else size
 
 
 class SceneChangedError(Exception):
@@ -190,7 +203,7 @@ class RenderResult(Generic[S]):
     encode_ms: float
     extrapolations: tuple[Extrapolation, ...]  # [C]; none of slices
     batch_size: int  # poses rendered together
-    place: Place | None = None  # of the data in that destination
+    place: Place | None = None  # of the data in that destination, whose caller gives it back
 
     @property
     def height(self) -> int:
@@ -247,6 +260,8 @@ class TaskPart(Generic[W]):
     first: int
     total: int
     deadline: float | None  # time.monotonic() in seconds, as in all processes; past it nobody takes its frames
+    offset: int = 0  # of the request's reply in its memory, bytes
+    room: int | None = None  # for the whole reply there, bytes; None: any
 
     def name_pose(self, index: int) -> str:
         """One of its poses as the caller names it."""

@@ -12,7 +12,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +33,7 @@ from ultragray_workers.pool.messages import (
     Search,
     SearchResult,
     UnloadTask,
+    reply_bytes,
 )
 from ultragray_workers.pool.processes import Launcher
 from ultragray_workers.pool.waiting import Expiry, Ticket, Turn, WaitingQueue
@@ -256,19 +257,15 @@ def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
         raise InvalidArgument(
             f"encoding {settings.encoding.value} holds the frame of one pose, got {poses} poses", field="encoding"
         )
-    pixels = poses * len(settings.outputs) * settings.picture.height * settings.picture.width
-    reply_bytes = pixels * settings.encoding.pixel_type.itemsize
-    if reply_bytes > MAX_REPLY_BYTES:
+    if (size := reply_bytes(settings, poses)) > MAX_REPLY_BYTES:
         raise InvalidArgument(
-            f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",
+            f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {size}",
             field="poses",
         )
 
 
 async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
-    request, place = ticket.request, None
-    if request.destination is not None:
-        place = request.destination.put(ticket.reply_memory, rendered.size)
+    request, place = ticket.request, ticket.hand_over()
     data = b"" if place is not None else await _read(ticket.reply_memory, rendered.size)
     return RenderResult(
         scene=request.scene,
@@ -282,7 +279,7 @@ async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
         encode_ms=rendered.encode_ms,
         extrapolations=rendered.extrapolations,
         batch_size=ticket.batch_size,
-        place=place,
+        place=None if place is None else replace(place, size=rendered.size),
     )
 
 

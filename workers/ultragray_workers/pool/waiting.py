@@ -15,7 +15,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest, Search
+from ultragray_workers.pool.messages import Place, Priority, Rendered, RenderRequest, Search
 from ultragray_workers.pool.turns import Forecast, Turns
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
@@ -46,7 +46,9 @@ class Ticket:
     rendered_poses: int = 0
     batch_size: int = 0
     memory: int | None = None  # descriptor of the file that its frames are written to, once it is begun
+    place: Place | None = None  # in that file, where it is the caller's
     archive: int | None = None  # and of the .npz that is made of them, where that is asked for
+    is_discarded: bool = False  # nobody waits for it any more
 
     @cached_property
     def kind(self) -> Hashable:
@@ -74,6 +76,13 @@ class Ticket:
         memory = self.memory if self.archive is None else self.archive
         assert memory is not None
         return memory
+
+    def hand_over(self) -> Place | None:
+        """The place of the reply in the caller's own memory, which is the caller's business from now on."""
+        place, self.place = self.place, None
+        if place is not None:
+            self.memory = None
+        return place
 
     def fail(self, error: Exception) -> None:
         if not self.done.done():

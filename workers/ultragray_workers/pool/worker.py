@@ -348,14 +348,16 @@ def _write_part(
     pixel_type = encoding.pixel_type
     if encoding.is_image_file:
         image = encoded_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)
-        write_at(memory, memoryview(image), 0)
         size = len(image)
+        if part.room is not None and size > part.room:
+            raise RenderFailed(f"the image file has {size} bytes, {part.room} were expected at most")
+        write_at(memory, memoryview(image), part.offset)
     else:
         for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
             for number, name in enumerate(outputs):
                 pixels = in_type(frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), pixel_type)
                 place = number * part.total + part.first + first - begin
-                write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
+                write_at(memory, pixels.data.cast("B"), part.offset + place * pixels[0].nbytes)
         size = len(outputs) * part.total * pixels[0].nbytes
     extrapolations = tuple(support.completed(begin, end))
     return replace(

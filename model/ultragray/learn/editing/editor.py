@@ -85,11 +85,14 @@ def _edited(
     if isinstance(edit, MergeEdit):
         if edit.scene not in others:
             raise InvalidArgument(f"scene must be one of those given, got {edit.scene!r}", field="scene")
-        scene, other = (_still(one.at_rest()) for one in (scene, others[edit.scene]))
+        scene, other = scene.at_rest(), others[edit.scene].at_rest()
         motion = edit.motion
         if edit.register:
-            motion = registered(scene, other, motion)
-        merged = merge(scene, _moved(other, motion), edit)
+            motion = registered(_still(scene), _still(other), motion)
+        other = _moved(other, motion)
+        merged = merge(_still(scene), _still(other), edit)
+        if scene.moving is not None and other.moving is not None and scene.moving.is_same(other.moving):
+            merged = replace(merged, moving=scene.moving, info=replace(merged.info, motion=scene.info.motion))
         return merged, [{**edit.recorded(), "motion": motion.tolist()}]
     done = _DONE.get(type(edit))
     if done is None:

@@ -400,6 +400,18 @@ def test_a_merge_tells_that_it_leaves_motion_out(scene, breathing):
     assert "left_out" not in still.info.provenance["edits"][0]
 
 
+def test_parts_of_a_moving_scene_move_when_they_are_merged_again(breathing):
+    merge = MergeEdit(scene="other", fit_steps=0, match_gain=False)
+    inside, outside = (edit_scene(breathing, [CutEdit(shape=AROUND, keep=side)]) for side in ("inside", "outside"))
+    merged = edit_scene(inside, [merge], others={"other": outside})
+    assert merged.moving.is_same(breathing.moving)
+    assert merged.info.motion == breathing.info.motion
+    assert "left_out" not in merged.info.provenance["edits"][0]
+    assert psnr_db(*(frames(one.at_phase([0.8]), np.eye(4)) for one in (merged, breathing))) > 40.0
+    elsewhere = edit_scene(outside, [MoveEdit(shift_mm=(4.0, 0.0, 0.0))])
+    assert edit_scene(inside, [merge], others={"other": elsewhere}).moving is None
+
+
 def test_motion_that_no_grid_holds_any_more_is_left_out_of_a_turned_scene(breathing):
     pulse = Motion((Mode("pulse", 0.0, 1.0),), origin_mm=(-22.0, -22.0, -2.0), spacing_mm=(0.85, 0.85, 0.85))
     moving = Moving(pulse, np.zeros((1, 53, 53, 53, 3), np.float32))

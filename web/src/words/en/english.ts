@@ -242,6 +242,7 @@ const sentences = {
   },
   edit: {
     gone: (scene: string): string => `${scene} (not here any more)`,
+    without: (what: string): string => `without ${what}`,
     remove: (number: number): string => `Remove edit ${number}`,
     painted: (count: number): string => (count === 1 ? "1 shape" : `${count} shapes`),
   },
