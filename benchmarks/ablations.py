@@ -1,21 +1,30 @@
-"""Trainings without one part each, and along the settings of texture, with three seeds: `make ablations`."""
+"""Trainings without one part each, and along the settings of texture, with three seeds: `make ablations`.
+
+The path of a hand's frames (`training.agreement`) has no settings for its parts; what decides on each is patched.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from bone_shadow import BoneShadow
+from hand import ALL, SWEEPS
 from measuring import Document, Lines, measure_runs, table
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
+from ultragray.learn.evaluation.held_out import score_held_out
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
-from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training import TrainingConfig, agreement
 from ultragray.learn.training.config import TEXTURE
+from ultragray_studies.hand import HandSweep
 from ultragray_studies.report import train_and_evaluate
 
 SEEDS = (0, 1, 2)
@@ -31,11 +40,22 @@ WITHOUT: Mapping[str, Mapping[str, Any]] = {
     "absorption has no price": {"absorption_penalty": 0.0},
     "no absorption": {"transmittance": False},
     "random start": {"start": "random"},
-    "poses as tracked": {"refine_poses": "none"},
 }
 CURVE: Mapping[str, Mapping[str, Any]] = {
     AS_IT_IS if value == TEXTURE else f"texture {value:g}": {} if value == TEXTURE else {"texture": value}
     for value in TEXTURES
+}
+HANDS = {"one pass of a hand": "one pass", "two passes of a hand": "two that cross"}
+# The settings, and what stands in the place of names of `agreement`, by the name of a training on the sweep of a hand.
+OF_PATH: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+    AS_IT_IS: ({}, {}),
+    "the tracker's noise stays": ({}, {"without_noise": lambda poses, ranges: poses}),
+    "no delay": ({}, {"GAIN_OF_DELAY_DB": math.inf}),
+    "no calibration": ({}, {"found_calibration": lambda sweep, ranges: np.eye(4)}),
+    "tissue is rigid": ({}, {"GAIN_OF_SHARES_DB": math.inf}),
+    "steps are not evened": ({}, {"GAIN_OF_EVENNESS_DB": math.inf}),
+    "passes need not agree": ({}, {"LOSS_OF_CROSSING_DB": -math.inf}),
+    "poses as tracked": ({"refine_poses": "none"}, {}),
 }
 SOURCES = {
     "ultranerf_liver_other_side": ("ultranerf_liver", SourceOptions("0:90", "90:180")),
@@ -67,12 +87,63 @@ def measure(name: str, settings: Mapping[str, Any], seed: int, data_folder: Path
     return figures
 
 
+def measure_hand(name: str, variation: str, seed: int, _: Path) -> Document:
+    """One training from the sweep of a hand with all its errors; its held-out frames as given and on its path."""
+    dataset = HandSweep.of(*SWEEPS[HANDS[name]]).recorded(ALL)
+    settings, parts = OF_PATH[variation]
+    config = TrainingConfig.preset("fast", **{**SHORTER, **settings}, seed=seed)
+    with ExitStack() as patches:
+        for part, instead in parts.items():
+            patches.enter_context(patch.object(agreement, part, instead))
+        trained = train_and_evaluate(dataset, config)
+        scores = score_held_out(trained.scene, dataset, trained.evaluation).to_dict()
+    found = {kind: one["mean"] for kind, one in scores.items() if one is not None}
+    return {**found, "config": config.to_dict()}
+
+
 RUNS = {
     f"{name}, {variation}, seed {seed}": partial(measure, name, settings, seed)
     for name in SOURCES
     for variation, settings in {**WITHOUT, **CURVE}.items()
     for seed in SEEDS
 }
+HAND_RUNS = {
+    f"{name}, {variation}, seed {seed}": partial(measure_hand, name, variation, seed)
+    for name in HANDS
+    for variation in OF_PATH
+    for seed in SEEDS
+}
+
+
+def of_sets(figures: Document) -> Document:
+    """The runs that are not of the sweep of a hand."""
+    return {name: run for name, run in figures.items() if name not in HAND_RUNS}
+
+
+def of_hands(figures: Document) -> Document:
+    """Those that are."""
+    return {name: run for name, run in figures.items() if name in HAND_RUNS}
+
+
+def path_without(figures: Document) -> Lines:
+    """Trainings on the path of a hand's frames, without one part of it each."""
+    names = [name for name in HANDS if any(run.startswith(name) for run in figures)]
+
+    def cell(name: str, variation: str, kind: str) -> str:
+        found = [figures.get(f"{name}, {variation}, seed {seed}", {}).get(kind) for seed in SEEDS]
+        runs = [one for one in found if one is not None]
+        if not runs:
+            return "–"
+        pairs = ((key, [run[key] for run in runs], digits) for key, digits in (("psnr_db", 2), ("gmsd", 3)))
+        return " / ".join(f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}" for _, values, digits in pairs)
+
+    kinds = {"as given": "as_given", "on the path": "on_path"}
+    heads = ("", *(f"{name}, {kind}" for name in names for kind in kinds))
+    rows = (
+        (variation, *(cell(name, variation, kind) for name in names for kind in kinds.values()))
+        for variation in OF_PATH
+    )
+    yield from table(heads, rows)
 
 
 def trained_without(figures: Document) -> Lines:
@@ -108,4 +179,4 @@ def trained_without(figures: Document) -> Lines:
 
 
 if __name__ == "__main__":
-    measure_runs("ablations", __doc__, RUNS)
+    measure_runs("ablations", __doc__, {**RUNS, **HAND_RUNS})

@@ -399,7 +399,8 @@ BLOCKS = {
     "results": Block("results_tables", results_tables.results),
     "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),
     "methods": Block("methods_tables", methods_tables.methods),
-    "ablations": Block("ablations", ablations.trained_without),
+    "ablations": Block("ablations", ablations.trained_without, ablations.of_sets),
+    "ablations of the path": Block("ablations", ablations.path_without, ablations.of_hands),
     "poses": Block("poses", poses.refined_poses),
     "hand": Block("hand", hand.predicted, hand.of_paths),
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
@@ -427,7 +428,7 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 
     def block(place: re.Match[str]) -> str:
         one = BLOCKS[place[1]]
-        if not (figures := read_kept(one.source)):
+        if not ((figures := read_kept(one.source)) and one.part(figures)):
             return f"{place[1]}{place[2]}Not measured yet: `make {TARGETS[one.source]} RECORD=1`.\n"
         lines = [*one.of(figures), ""]
         lines[-2] = f"`{kept(one.source).relative_to(measuring.ROOT)}`: {lines[-2]}"
@@ -439,8 +440,10 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 def show(target: str) -> None:
     """Print the tables of what a target measured."""
     for name, one in BLOCKS.items():
-        if TARGETS[one.source] == target and (found := read(staged(one.source))):
-            sys.stdout.write("\n".join((f"# {name}", "", *one.of(_beside_kept(one.source, found)), "", "")))
+        if TARGETS[one.source] != target or not (found := read(staged(one.source))):
+            continue
+        if one.part(found := _beside_kept(one.source, found)):
+            sys.stdout.write("\n".join((f"# {name}", "", *one.of(found), "", "")))
 
 
 def listing() -> Iterator[str]:

@@ -208,7 +208,7 @@ def render_report(content: ReportContent) -> str:
         content.dataset,
         content.scene,
         {
-            one.description.title: Prediction(evaluation, frames_of(content.folder, one.name))
+            one.description.title: Prediction(evaluation, frames_of(content.folder, one.name), one.on_path)
             for one, evaluation in compared.items()
         },
         content.comparison.machine,

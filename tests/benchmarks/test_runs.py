@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.sweep import Sweep
+from ultragray.learn.training import agreement
 from ultragray.learn.training.agreement import with_shares
 from ultragray.phantom.demo import demo_poses, load_demo_scene
 from ultragray.rendering.frames import render
@@ -113,3 +115,21 @@ def test_what_policies_reached_is_a_row_for_each():
     found = {"starts": 200, "learned_s": 100.0, "reached": 0.925, "steps": 9.0, "confidence": 0.5}
     *_, row = policy.reached_planes({"frames alone": found})
     assert row == "| frames alone | 200 | 92% | 9 | 0.50 | 100 s |"
+
+
+def test_trainings_of_a_hand_are_measured_without_one_part_of_their_path_each(monkeypatch):
+    tracked = hand_path()
+    following = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    monkeypatch.setattr(ablations.HandSweep, "of", lambda *_: SimpleNamespace(recorded=lambda errors: following))
+    monkeypatch.setattr(ablations, "SHORTER", {**SETTINGS, "confidence": False})
+    names = [
+        f"one pass of a hand, {part}, seed 0" for part in (ablations.AS_IT_IS, "tissue is rigid", "poses as tracked")
+    ]
+    found = {name: ablations.HAND_RUNS[name](Path()) for name in names}
+    assert ["on_path" in run for run in found.values()] == [True, False, False]
+    for variation, (_, parts) in ablations.OF_PATH.items():
+        assert all(hasattr(agreement, part) for part in parts), variation
+    head, _, as_it_is, *others = ablations.path_without(ablations.of_hands(found))
+    assert head == "|  | one pass of a hand, as given | one pass of a hand, on the path |"
+    assert f"{found[names[0]]['on_path']['psnr_db']:.2f} ± 0.00" in as_it_is
+    assert others[-1].endswith("| – |")

@@ -35,8 +35,17 @@ SCENE_FILE = "scene.ugr"
 SECONDS_FILE = "seconds.json"  # that the fit took in all
 
 
+class _OfScene(Method):
+    """Either of the two below."""
+
+    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray | None:
+        assert isinstance(fitted, SceneFit)
+        held_out = held_out_on_path(dataset, fitted.scene)
+        return None if held_out is None else replace(fitted, scene=fitted.scene.at_rest()).predict(held_out)
+
+
 @dataclass(frozen=True)
-class SceneMethod(Method):
+class SceneMethod(_OfScene):
     """A training with this project's trainer. An equal time is what its preset `fast` takes: it has no other budget."""
 
     name: str = "scene"
@@ -71,9 +80,8 @@ class SceneMethod(Method):
         if resume:
             assert folder is not None
             seconds += read_checkpoint_header(folder / CHECKPOINT_FILE).elapsed_s  # of the run that was killed
-        # The frames that are held out are for those who compare, not for the trainer to measure with.
         scene = train(
-            Dataset(dataset.name, train=dataset.train, val=dataset.train.select([])),
+            dataset,  # with the frames that are held out: their poses are part of the path
             self.config(budget, run.seed),
             folder=folder,
             resume=resume,
@@ -85,7 +93,6 @@ class SceneMethod(Method):
         if scene.info.training["step"] < scene.info.training["steps"]:
             return None
         seconds += time.perf_counter()
-        scene = replace(scene, info=replace(scene.info, dataset_sha256=dataset.sha256))  # with its held-out frames
         if folder is None:
             cost = self._cost(scene, seconds, len(scene.to_bytes()))
             return SceneFit(scene.to(training_device(run.device, "auto")), cost)
@@ -93,11 +100,6 @@ class SceneMethod(Method):
         scene.save(folder / SCENE_FILE)
         (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
         return self._fitted(scene, folder, run.device)
-
-    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray | None:
-        assert isinstance(fitted, SceneFit)
-        held_out = held_out_on_path(dataset, fitted.scene)
-        return None if held_out is None else fitted.predict(held_out)
 
     def _fitted(self, scene: GaussianScene, folder: Path, device: str) -> SceneFit:
         seconds = float(json.loads((folder / SECONDS_FILE).read_text(encoding="utf-8")))
@@ -109,7 +111,7 @@ class SceneMethod(Method):
 
 
 @dataclass(frozen=True, eq=False)
-class GivenScene(Method):
+class GivenScene(_OfScene):
     """A scene that is there already, to be measured beside others."""
 
     scene: GaussianScene

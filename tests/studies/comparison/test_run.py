@@ -10,11 +10,13 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInval
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames
 from ultragray.learn.sweep import Distances
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.comparison.page import render_comparison
 from ultragray_studies.comparison.result import MethodResult
 from ultragray_studies.comparison.run import EQUAL_TIME, compare_methods, default_paces, frames_of
 from ultragray_studies.comparison.tables import latex_table
 from ultragray_studies.methods.classical import FromFrames
+from ultragray_studies.methods.gaussians import SCENE_FILE
 from ultragray_studies.methods.method import Pace, Paces
 from ultragray_studies.methods.registry import chosen_methods
 
@@ -49,9 +51,9 @@ def test_each_method_is_a_row_and_one_that_fails_says_why(dataset, methods, pace
         assert again.mean.psnr_db == pytest.approx(evaluation.mean.psnr_db, abs=0.1)  # bytes, rounded
 
 
-def test_frames_of_a_tracker_that_shakes_are_also_measured_on_the_path(paces, tmp_path):
+def test_frames_of_a_tracker_that_shakes_are_also_measured_on_the_path(scene_method, paces, tmp_path):
     truth = hand_path()
-    chosen = chosen_methods(["linear", "median", "in-time"])
+    chosen = {"scene": scene_method, **chosen_methods(["linear", "median", "in-time"])}
     found = {}
     for name, tracked in (("shaken", shaken(truth, 0.3, 0.2)), ("exact", truth)):
         given = recording(truth, tracked)
@@ -61,7 +63,10 @@ def test_frames_of_a_tracker_that_shakes_are_also_measured_on_the_path(paces, tm
         assert rows[name].on_path.psnr_db > rows[name].evaluation.mean.psnr_db + 0.5
         assert MethodResult.from_dict(rows[name].to_dict()).on_path == rows[name].on_path
     assert rows["in-time"].on_path is None  # it has no use for poses
-    assert rows["in-time"].evaluation.frames == found["exact"].results[2].evaluation.frames
+    assert rows["in-time"].evaluation.frames == found["exact"].results[3].evaluation.frames
+    scene = GaussianScene.load(tmp_path / "shaken" / "scene" / SCENE_FILE)
+    assert rows["scene"].on_path.psnr_db == pytest.approx(scene.info.metrics["psnr_db"])
+    assert rows["scene"].on_path != rows["scene"].evaluation.mean
     assert "on the path, dB" in latex_table(found["shaken"])
     assert "on the path" not in latex_table(found["exact"])
     assert "on the path, dB" in render_comparison(found["shaken"], recording(truth, truth), tmp_path / "shaken")

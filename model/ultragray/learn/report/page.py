@@ -16,10 +16,12 @@ import numpy.typing as npt
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from ultragray.installation import __version__
+from ultragray.learn.evaluation.held_out import score_held_out
+from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, render_sweep
 from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
 from ultragray.learn.report.plots import plot_frames, plot_training, svg
-from ultragray.learn.report.tables import METRICS, DatasetFacts, Row, metric_rows, rank_rows, speckle_rows
+from ultragray.learn.report.tables import METRICS, DatasetFacts, Row, metric_rows, path_row, rank_rows, speckle_rows
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.progress import Course
 from ultragray.rendering.pixels import ByteArray, png_file, to_uint8
@@ -94,15 +96,18 @@ def _address(frame: npt.NDArray[np.float32], sweep: Sweep) -> str:  # [H, W]
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The held-out frames [F, H, W] as something expects them, in 256 greys, and their scores."""
+    """The held-out frames [F, H, W] as something expects them at the poses given, in 256 greys, and their scores."""
 
     evaluation: Evaluation
     frames: ByteArray
+    on_path: FrameMetrics | None = None  # the means on the path; None: not measured there, or it is as given
 
     @classmethod
-    def of_scene(cls, scene: GaussianScene, sweep: Sweep) -> Prediction:
-        frames = np.clip(render_sweep(scene, sweep), 0.0, 1.0)
-        return cls(evaluate_frames(frames, sweep), to_uint8(frames))
+    def of_scene(cls, scene: GaussianScene, dataset: Dataset) -> Prediction:
+        frames = np.clip(render_sweep(scene, dataset.val), 0.0, 1.0)
+        as_given = evaluate_frames(frames, dataset.val)
+        on_path = score_held_out(scene, dataset, as_given).on_path
+        return cls(as_given, to_uint8(frames), None if on_path is None else on_path.mean)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +138,17 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
     """The HTML text. A template of one of these packages that extends `scene.html` is given `more`, too."""
     evaluations = {title: one.evaluation for title, one in page.predictions.items()}
     is_alone = len(evaluations) + len(page.failures) == 1
+    on_path = {title: one.on_path for title, one in page.predictions.items() if one.on_path is not None}
+    rows = []
+    for row in metric_rows(evaluations):
+        rows += [row, path_row(row.name, on_path[row.name])] if row.name in on_path else [row]
     settings = {} if page.course is None else page.scene.info.training
     values = {
         "title": page.dataset.name,
         "facts": _facts(page),
         "is_alone": is_alone,
-        "rows": [*metric_rows(evaluations), *(Row(title, failure=why) for title, why in page.failures.items())],
+        "has_path": bool(on_path),
+        "rows": [*rows, *(Row(title, failure=why) for title, why in page.failures.items())],
         "ranks": [] if is_alone else rank_rows(evaluations),
         "speckle": speckle_rows(evaluations),
         "scales": page.evaluation.ms_ssim_scales,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ultragray.learn.sweep import Dataset
 
 if TYPE_CHECKING:
+    from ultragray.learn.evaluation.metrics import FrameMetrics
     from ultragray.learn.evaluation.scoring import Evaluation
     from ultragray.learn.evaluation.speckle import Speckle, SpeckleSummary
 
@@ -109,6 +110,12 @@ def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[
         ]
         rows.append(Row(name, cells, (notes or {}).get(name, [])))
     return rows
+
+
+def path_row(name: str, on_path: FrameMetrics) -> Row:
+    """The row of a method's means on the path, which has no part in the ranks."""
+    means = on_path.to_dict()
+    return Row(f"{name}, on the path", [(shown_value(metric.name, means[metric.name]), False) for metric in METRICS])
 
 
 def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:

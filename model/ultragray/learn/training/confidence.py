@@ -7,14 +7,14 @@ not see, some that it did, frames extrapolated from one side of the sweep, and a
 decides what a scene's own frames leave open. The least squares are solved by Levenberg-Marquardt steps with w ≥ 0 but
 for its first entry. `fit_uncertainty` explains squared errors of pixels by the same distances.
 
-In reading order: which frames are held out, predictions of frames from others, hardness, the fit of the weights,
-one-sided examples, uncertainty, and `fit_confidence`, which calls all of them.
+In reading order: which frames are held out, predictions of frames from one side, hardness, the fit of the weights,
+uncertainty, and `fit_confidence`, which calls all of them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TypeAlias
@@ -39,6 +39,7 @@ from ultragray.scene.confidence import (
     FAR_MM,
     NEAR_MM,
     POINTS_PER_SIDE,
+    SMALLEST_MM,
     TERMS,
     ConfidenceModel,
     DepthBands,
@@ -116,7 +117,8 @@ MOST_HELPERS = 16
 class Prediction:
     """How near to a frame a prediction from other frames came, and how its pose lies to those."""
 
-    row: int  # of Neighbours.targets
+    target: int  # its place in the sweep
+    is_nearest: bool  # whether from the nearest frames on a side
     ms_ssim: float
     measures: ViewMeasures  # of one pose; its weights are of the helpers
 
@@ -129,23 +131,19 @@ class Neighbours:
         self._small = replace(sweep, images=_pooled(sweep.images))
         views = TrainingViews(sweep.poses, sweep.probe)
         self._distances_mm = views.mean_distances_mm(sweep.poses[self.targets], sweep.probe)  # [T, F]
-        self._distances_mm[np.arange(len(self.targets)), self.targets] = -1.0  # never its own helper
-        self.weights: FloatArray = views.measure(sweep.poses[self.targets], sweep.probe).weights  # [T, F]
 
-    def helpers(self, row: int, beyond_mm: float, among: npt.NDArray[np.bool_] | None = None) -> tuple[int, ...]:
-        """The MOST_HELPERS frames nearest to a target, of those farther away than this and, if given, `among` [F]."""
-        distances = self._distances_mm[row]
-        allowed = distances > beyond_mm if among is None else (distances > beyond_mm) & among
-        order = np.argsort(distances, kind="stable")
-        return tuple(order[allowed[order]][:MOST_HELPERS].tolist())
+    def helpers(self, row: int, among: npt.NDArray[np.bool_]) -> tuple[int, ...]:  # [F]
+        """The MOST_HELPERS frames nearest to a target, of those `among` which it is not."""
+        order = np.argsort(self._distances_mm[row], kind="stable")
+        return tuple(order[among[order]][:MOST_HELPERS].tolist())
 
-    def predict(self, row: int, helpers: tuple[int, ...]) -> Prediction:
+    def predict(self, row: int, helpers: tuple[int, ...], *, is_nearest: bool) -> Prediction:
         some, target = self._small.select(list(helpers)), self.targets[row]
         pose = self._small.poses[target : target + 1]
         picture = torch.from_numpy(interpolate_planes(some, pose))
         truth = torch.from_numpy(self._small.images[target : target + 1]).float().div_(255.0)
         measures = TrainingViews(some.poses, some.probe).measure(pose, some.probe)
-        return Prediction(row, frame_metrics(picture, truth)[0].ms_ssim, measures)
+        return Prediction(int(target), is_nearest, frame_metrics(picture, truth)[0].ms_ssim, measures)
 
 
 def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
@@ -157,43 +155,52 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
     return torch.stack(pooled).round().to(torch.uint8).numpy()
 
 
-MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
-EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this distance of the one that is predicted are not used
+MOST_TARGETS = 192  # frames that are predicted
+BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
+
+
+def one_sided(sweep: Sweep) -> list[Prediction]:
+    """Some frames of a sweep, each extrapolated from those before it and from those behind it, ever farther away.
+
+    A sweep of one or two frames has none.
+    """
+    neighbours, path = Neighbours(sweep, MOST_TARGETS), path_mm(sweep)
+    found = []
+    for row, target in enumerate(neighbours.targets):
+        for ahead in (path - path[target], path[target] - path):
+            choices = (neighbours.helpers(row, ahead > beyond_mm) for beyond_mm in BEYOND_MM)
+            found += [
+                neighbours.predict(row, helpers, is_nearest=not number)
+                for number, helpers in enumerate(dict.fromkeys(choices))
+                if len(helpers) > 1
+            ]
+    return found
+
+
 LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
 SMOOTHING = 0.01
 
 
-def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
-    """The shortfall of each frame's prediction by others against the usual one at such distances, in logits.
+def hardness_of_views(sweep: Sweep, predictions: Sequence[Prediction]) -> FloatArray:  # [F]
+    """How far the frames on either side of each frame tell less of it than is usual at such distances, in logits.
 
-    Some frames are interpolated linearly between others, once with all of them and then without those near by; what
-    the distances do not explain is the hardness, smoothed over the views around.
+    A mean over both sides by the squares of their distances: where frames lie close on one side, and a gap is on the
+    other that shows something else behind it, poses are asked for in the gap. It is smoothed over the views around.
+    `predictions` are the `one_sided` of the sweep.
     """
-    neighbours = Neighbours(sweep, MAX_FRAMES)
-    found, measured = [], []
-    for row in range(len(neighbours.targets)):
-        for helpers in dict.fromkeys(neighbours.helpers(row, excluded_mm) for excluded_mm in EXCLUDED_MM):
-            if len(helpers) < 2:
-                continue
-            prediction = neighbours.predict(row, helpers)
-            measured.append(prediction.ms_ssim)
-            near = prediction.measures.distance_mm[0].mean()
-            between = prediction.measures.interpolation_mm[0].mean()
-            found.append((row, 1.0, np.log(between + NEAR_MM), near, np.log(near + NEAR_MM)))
-    if not found:
+    if not predictions:
         return np.zeros(len(sweep))
-    table = np.array(found)
-    quality = np.clip(np.array(measured), *LIMITS)
+    distances_mm = np.array([one.measures.distance_mm.mean() for one in predictions])
+    quality = np.clip([one.ms_ssim for one in predictions], *LIMITS)
     logits = np.log(quality / (1.0 - quality))
-    terms = table[:, 1:]
-    fitted = np.linalg.solve(terms.T @ terms + SMOOTHING * len(terms) * np.diag([0.0, 1.0, 1.0, 1.0]), terms.T @ logits)
+    terms = np.stack([np.ones_like(distances_mm), distances_mm, np.log(distances_mm + NEAR_MM)], axis=1)
+    fitted = np.linalg.solve(terms.T @ terms + SMOOTHING * len(terms) * np.diag([0.0, 1.0, 1.0]), terms.T @ logits)
     misses = terms @ fitted - logits
-    rows = table[:, 0].astype(np.int64)
-    targets = neighbours.targets
-    counts = np.bincount(rows, minlength=len(targets))
-    own = np.bincount(rows, misses, len(targets)) / np.maximum(counts, 1)  # [T]
+    targets, rows = np.unique([one.target for one in predictions], return_inverse=True)
+    shares = np.where([one.is_nearest for one in predictions], np.square(distances_mm), 0.0)
+    sums, totals = (np.bincount(rows, values, len(targets)) for values in (shares * misses, shares))
     weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
-    return weights @ own
+    return weights @ sums / np.maximum(weights @ totals, SMALLEST_MM)
 
 
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
@@ -276,27 +283,17 @@ def fit_weights(
     return weights[:-1]
 
 
-ONE_SIDED_FRAMES = 96  # that are predicted
-BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
-
-
-def one_sided_examples(sweep: Sweep, hardness: FloatArray) -> Examples:
-    """Some frames of a sweep, each extrapolated from those before it and from those behind it, ever farther away.
-
-    `hardness` [F] of its frames. A sweep of one or two frames has no examples.
-    """
-    neighbours, path = Neighbours(sweep, ONE_SIDED_FRAMES), path_mm(sweep)
-    predictions = []
-    for row, target in enumerate(neighbours.targets):
-        for ahead in (path - path[target], path[target] - path):
-            choices = (neighbours.helpers(row, beyond_mm, among=ahead > beyond_mm) for beyond_mm in BEYOND_MM)
-            predictions += [neighbours.predict(row, helpers) for helpers in dict.fromkeys(choices) if len(helpers) > 1]
+def one_sided_examples(sweep: Sweep, predictions: Sequence[Prediction], hardness: FloatArray) -> Examples:
+    """The `one_sided` predictions of a sweep, with the `hardness` [F] of its frames."""
     if not predictions:
         return Examples(np.zeros((0, POINTS_PER_SIDE**2, 1 + TERMS)), np.zeros(0))
+    targets = [one.target for one in predictions]
     names = ("nearest_mm", "distance_mm", "interpolation_mm", "angle_deg")
     distances = {name: np.concatenate([getattr(one.measures, name) for one in predictions]) for name in names}
-    measures = ViewMeasures(**distances, weights=neighbours.weights[[one.row for one in predictions]])
-    return Examples(terms_of(measures, hardness), np.array([one.ms_ssim for one in predictions]))
+    weights = TrainingViews(sweep.poses, sweep.probe).measure(sweep.poses[targets], sweep.probe).weights  # [E, F]
+    return Examples(
+        terms_of(ViewMeasures(**distances, weights=weights), hardness), np.array([one.ms_ssim for one in predictions])
+    )
 
 
 LOOKED_AT = 40_000  # cells, over all frames
@@ -408,11 +405,12 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     ms_ssim, shares = _measured(scene, both, backend)
     views = TrainingViews(part.train.poses, sweep.probe)
     measures = views.measure(both.poses, sweep.probe)
-    terms = terms_of(measures, hardness_of_views(part.train))
+    terms = terms_of(measures, hardness_of_views(part.train, one_sided(part.train)))
     some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
     black = evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim  # that black frames reach
-    hardness = hardness_of_views(sweep)
-    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
+    predictions = one_sided(sweep)
+    hardness = hardness_of_views(sweep, predictions)
+    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, predictions, hardness))
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
     return ConfidenceModel(
         weights=tuple(weights.tolist()),

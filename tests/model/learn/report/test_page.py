@@ -6,12 +6,16 @@ from html.parser import HTMLParser
 
 import pytest
 
+from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
 from ultragray.learn.report.plots import write_training_curve
 from ultragray.learn.training import train
 from ultragray.learn.training.progress import Course
 from ultragray.learn.training.trainer import JOURNAL_FILE
+
+from ..training.test_agreement import hand_path, recording
+from ..training.test_poses import shaken
 
 VOID = {"meta", "img", "link", "br"}
 
@@ -55,7 +59,7 @@ def page(tiny_dataset, tiny_config, tmp_path):
     assert course.val_psnr_db == {one.val_step: one.val_psnr_db for one in seen if one.val_step is not None}
     assert course.seconds == pytest.approx(6 * course.step_s)
     assert course.seconds > 0.0
-    predictions = {THIS_SCENE: Prediction.of_scene(scene, dataset.val)}
+    predictions = {THIS_SCENE: Prediction.of_scene(scene, dataset)}
     return ScenePage(dataset, scene, predictions, "a machine", scene_name="ball & <noise>", spread=2, course=course)
 
 
@@ -75,3 +79,18 @@ def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page, tmp_path):
     assert re.findall(r"<h2>(.*?)</h2>", read_from_a_file) == ["Held-out frames", "Pictures"]
     write_training_curve(page.course, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_scene_on_a_path_of_its_own_has_a_row_of_scores_there(tiny_config):
+    truth = hand_path()
+    dataset = recording(truth, shaken(truth, 0.3, 0.2))
+    scene = train(dataset, tiny_config(refine_poses="path"))
+    prediction = Prediction.of_scene(scene, dataset)
+    assert prediction.on_path == FrameMetrics(**scene.info.metrics)
+    assert prediction.on_path != prediction.evaluation.mean
+    text = render_page(ScenePage(dataset, scene, {THIS_SCENE: prediction}, "a machine", spread=1))
+    Checked(text)
+    names = [THIS_SCENE, f"{THIS_SCENE}, on the path", "true frames", THIS_SCENE]
+    assert re.findall(r'<th scope="row">(.*?)</th>', text) == names
+    assert f"<td>{prediction.on_path.psnr_db:.2f}</td>" in text
+    assert "no held-out image has a part in" in text

@@ -26,6 +26,7 @@ from ultragray.learn.training.confidence import (
     hardness_of_views,
     held_out_frames,
     likeliest_variances,
+    one_sided,
     one_sided_examples,
     shorter,
 )
@@ -214,9 +215,28 @@ def changing_sweep(count, side):
 @pytest.mark.long
 @pytest.mark.parametrize("side", [32, 128])
 def test_hard_is_where_neighbours_do_not_tell(side):
-    hardness = hardness_of_views(changing_sweep(24, side))
+    sweep = changing_sweep(24, side)
+    hardness = hardness_of_views(sweep, one_sided(sweep))
     assert hardness.shape == (24,)
     assert hardness[:9].max() < -1.0 < 1.0 < hardness[15:].min()
+
+
+def test_a_gap_is_hard_where_its_edges_differ():
+    """A texture that drifts sideways, evenly but for a gap of 8 mm; behind that either the same one or another."""
+    textures = np.random.default_rng(1).integers(0, 255, (2, 8, 15))
+    alike, different = (np.kron(textures[[0, other]], np.ones((8, 16), int)).astype(np.uint8) for other in (0, 1))
+    poses = np.tile(np.eye(4), (16, 1, 1))
+    poses[:, 1, 3] = np.arange(16) + np.repeat([0.0, 7.0], 8)
+    found = []
+    for texture in (alike, different):
+        images = np.stack(
+            [np.roll(texture[place // 8], round(y), axis=1)[:, :64] for place, y in enumerate(poses[:, 1, 3])]
+        )
+        sweep = Sweep(images, poses, PROBE, np.arange(16), "test")
+        found.append(hardness_of_views(sweep, one_sided(sweep)))
+    of_alike, of_different = found
+    assert of_different[[7, 8]].min() > of_alike[[7, 8]].max() + 0.5
+    assert of_different[[7, 8]].min() > of_different[[2, 13]].max() + 0.5
 
 
 def sweep_at(poses):
@@ -278,8 +298,13 @@ def drifting_sweep(count, columns_per_frame):
     return Sweep(images, poses, PROBE, np.arange(count), "test")
 
 
+def examples_of(sweep):
+    """All equally hard."""
+    return one_sided_examples(sweep, one_sided(sweep), np.zeros(len(sweep)))
+
+
 def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
-    examples = one_sided_examples(drifting_sweep(FRAMES, 1), np.zeros(FRAMES))
+    examples = examples_of(drifting_sweep(FRAMES, 1))
     distances = -examples.terms[:, 0, 2] * DISTANCE_MM
     assert sorted(set(distances.round(3))) == [1.0, 2.0, 4.0, 6.0, 9.0, 13.0]  # one step beyond each of BEYOND_MM
     assert len(BEYOND_MM) == 6
@@ -289,7 +314,7 @@ def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
 
 def test_scores_fall_with_distance_where_anatomy_changes_and_only_there():
     for columns_per_frame, falls in ((1, True), (0, False)):
-        examples = one_sided_examples(drifting_sweep(12, columns_per_frame), np.zeros(12))
+        examples = examples_of(drifting_sweep(12, columns_per_frame))
         distances = -examples.terms[:, 0, 2] * DISTANCE_MM
         near, far = (examples.ms_ssim[chosen].mean() for chosen in (distances < 1.5, distances > 8.0))
         assert (near - far > 0.2) if falls else (near == pytest.approx(far, abs=1e-6))

@@ -83,11 +83,12 @@ class Finishing:
         measured = len(held_out_frames(dataset.train)) if config.confidence else 0
         fitted = 0 if measured < LEAST_HELD_OUT else min(measured, MEASURED_FRAMES) + MEASURED_FRAMES // 3
         shown = PICTURES + min(held_out, REPORT_FRAMES)
+        reported = 2 * held_out if config.refine_poses in WITH_PATH else held_out  # at most: also on the path
         # renderings and scores of each phase
         self._work = {
             "evaluation": (float(held_out), held_out),
             "confidence": (CONFIDENCE_RENDERINGS * fitted, fitted + (BLACK_FRAMES if fitted else 0)),
-            "report": (float(held_out + _PANELS * shown), held_out) if held_out else (0.0, 0),
+            "report": (float(reported + _PANELS * shown), reported) if held_out else (0.0, 0),
         }
         self._plots_s = PLOTS_S if held_out else 0.0
 
@@ -240,7 +241,7 @@ def _finish(
 
 def _write_report(job: TrainJob, dataset: Dataset, scene: GaussianScene, artifacts: Path, machine: str) -> None:
     """Pictures of some held-out frames, and the page of the scene."""
-    prediction = Prediction.of_scene(scene, dataset.val)
+    prediction = Prediction.of_scene(scene, dataset)
     write_spread(scene, dataset.val, prediction.evaluation, artifacts, PICTURES)
     page = ScenePage(
         dataset,
