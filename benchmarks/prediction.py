@@ -1,5 +1,9 @@
 """The error of a shown frame's pose, with the newest pose and with a foretold one: `make prediction`.
 
+Beside both stands what the best linear predictor would have left, which nobody has before the path is over: the shares
+of the last steps between poses, the same along all axes, that fit the whole path best. Where it leaves much, the path
+cannot be foretold from its own past.
+
 Frames are seen 20 to 1,000 ms after their poses were measured, each time 30% earlier or later at random. Paths are
 those of simulated hands whose truth is known, of a robot that scans a raster, and recorded ones, whose truth between
 two poses is taken as straight.
@@ -22,6 +26,7 @@ from ultragray_studies.hand import MARGIN_S, Hand
 
 AHEAD_MS = (20, 50, 100, 300, 1000)
 JITTER = 0.3  # share of the time ahead
+STEPS, POSES_A_STEP = 24, 8  # between poses, that the best linear predictor weighs: one for so many poses, at most
 SECONDS = 15.0  # of a simulated path
 ROBOT_MM_PER_S, ROBOT_WAY_MM, ROBOT_TURN_S = 20.0, 60.0, 0.5
 ROBOT_NOISE = 0.02  # mm and degrees, of its encoders and the tracker of its base
@@ -101,7 +106,24 @@ def errors(times_s: FloatArray, poses: FloatArray, truth: Poses, ahead_s: float)
         "without": rms(poses[known], true),
         "with": rms(np.stack(foretold)[known], true),
         "told": np.sqrt(np.square(told)[known].mean(axis=0)).tolist(),
+        "at_best": at_best(times_s, poses, seen_s, truth),
     }
+
+
+def at_best(times_s: FloatArray, poses: FloatArray, seen_s: FloatArray, truth: Poses) -> list[float]:
+    """Root mean square errors, mm and degrees, of the best linear predictor in hindsight."""
+    known = seen_s <= times_s[-1]
+    true, rotations = truth(seen_s[known]), poses[:, :3, :3]
+    walked = np.diff(poses[:, :3, 3], axis=0), turns_of(rotations[:-1].transpose(0, 2, 1) @ rotations[1:])
+    motions = true[:, :3, 3] - poses[known, :3, 3], turns_of(rotations[known].transpose(0, 2, 1) @ true[:, :3, :3])
+    steps, left = max(1, min(STEPS, len(true) // POSES_A_STEP)), []
+    for moves, right in zip(walked, motions, strict=True):
+        speeds = np.concatenate([np.zeros((steps, 3)), moves / np.diff(times_s)[:, None]])  # none before the first pose
+        last = np.stack([speeds[steps - back :][: len(poses)] for back in range(1, steps + 1)], axis=-1)  # [N, 3, S]
+        foretold = (last * (seen_s - times_s)[:, None, None])[known].reshape(-1, steps)
+        shares = np.linalg.lstsq(foretold, right.ravel(), rcond=None)[0]
+        left.append(float(np.sqrt(np.square(right.ravel() - foretold @ shares).sum() / len(true))))
+    return [left[0], float(np.degrees(left[1]))]
 
 
 def rms(poses: FloatArray, true: FloatArray) -> list[float]:  # mm, degrees
@@ -112,7 +134,9 @@ def rms(poses: FloatArray, true: FloatArray) -> list[float]:  # mm, degrees
 
 def foretold_poses(runs: Document) -> Lines:
     """Errors by path and time ahead."""
-    text = "{without[0]:.2f} → {with[0]:.2f} mm, {without[1]:.2f} → {with[1]:.2f}°"
+    text = (
+        "{without[0]:.2f} → {with[0]:.2f} ({at_best[0]:.2f}) mm, {without[1]:.2f} → {with[1]:.2f} ({at_best[1]:.2f})°"
+    )
     rows = (
         {"path": name, **{f"in {ms}": text.format_map(found) if found else "–" for ms, found in run["ahead"].items()}}
         for name, run in runs.items()

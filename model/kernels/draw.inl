@@ -307,6 +307,7 @@ inline void each_slice(const View& view, const Slice* slices, int64_t count, int
 }
 
 void draw(const View& view, const Slice* slices, int64_t count, const Strip& strip) {
+    const SmallestAreZero flushed;
     each_slice(view, slices, count, strip.first, strip.lines, [&](const Slice& s, int from, int to) {
         const Course course = course_of(view, s);
         for (int column = from; column <= to; column += kLanes) draw_group(view, s, course, strip, column);

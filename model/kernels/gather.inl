@@ -440,6 +440,7 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
 void gather(const SceneView& scene, const View& view, const Slice* slices, int64_t count, const PixelGradients& pixels,
             GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments, ViewGradient* by_view,
             float* const* by_fields) {
+    const SmallestAreZero flushed;
     const auto differentiate = [&](auto thick, const Candidates& c, const SliceGradients& by) {
         (view.field_count
              ? differentiate_slices<thick, true>

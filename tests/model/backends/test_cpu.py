@@ -55,6 +55,17 @@ def test_the_number_of_threads_does_not_change_a_bit(random_scene, instruction_s
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_the_callers_thread_keeps_its_smallest_numbers(random_scene, instruction_set):
+    torch.set_num_threads(1)  # the caller draws
+    scene = random_scene(count=100)
+    cpu.render_outputs(
+        scene, PROBE, scene.poses_to_scene_cm(poses(1)), 9, 9, ("bmode",), instruction_set=instruction_set
+    )
+    assert np.float32(1e-30) * np.float32(1e-10) > 0.0
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
 @pytest.mark.parametrize("size", [(65, 193), (3, 5)])
 def test_bytes_of_one_pass_are_those_of_the_planes(random_scene, instruction_set, size):
     scene = random_scene(count=5000)
