@@ -201,7 +201,7 @@ inline Floats exponential(Floats x) {
     return p * (Floats)exponent;
 }
 
-// While it lives, numbers too small for a normal float are 0 on x86, where each of them would cost a hundred cycles: the
+// While it lives, numbers too small for a normal float are 0 on x86, where each of them costs many times a usual one: the
 // weight of a slice falls to them within a few lines and rows of its window.
 class SmallestAreZero {
 #if defined(__SSE__)
