@@ -8,7 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -160,9 +160,10 @@ class RunningWorker:
     def job_process(self):
         """The process of the job at hand."""
         for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
-            for pid in children.read_text().split():
-                if "worker.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
-                    return int(pid)
+            with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended, or its thread has
+                for pid in children.read_text().split():
+                    if "worker.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
+                        return int(pid)
         return None
 
 
