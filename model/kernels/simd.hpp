@@ -203,7 +203,7 @@ inline Floats exponential(Floats x) {
 
 // While it lives, numbers too small for a normal float are 0 on x86, where each of them costs many times a usual one: the
 // weight of a slice falls to them within a few lines and rows of its window.
-class SmallestAreZero {
+class [[maybe_unused]] SmallestAreZero {
 #if defined(__SSE__)
  public:
     SmallestAreZero() : before_(_mm_getcsr()) { _mm_setcsr(before_ | 0x8040); }  // FTZ and DAZ
