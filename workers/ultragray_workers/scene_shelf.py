@@ -21,6 +21,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
@@ -138,23 +139,18 @@ class SceneShelf:
 
     def here(self, name: str) -> Path | None:
         """The file of the scene on this host; None where it has to be fetched first, or there is none."""
-        with self.hold(name, counts=False) as path:
+        with self.hold(name, counts=False) or nullcontext() as path:
             return path
 
-    @contextlib.contextmanager
-    def hold(self, name: str, *, counts: bool = True) -> Iterator[Path | None]:
-        """As `here`; the file stays during the body. It `counts` as a use of the cache."""
+    def hold(self, name: str, *, counts: bool = True) -> AbstractContextManager[Path] | None:
+        """As `here`; the file stays until the context is left. It `counts` as a use of the cache."""
         if (path := self._near_file(name)) is not None:
-            yield path
-        elif (placed := self._known_as(name)) is None:
-            yield None
-        elif (path := self.storage.in_place(placed.key)) is not None:
-            yield path
-        elif (pin := self._cached(placed, counts=counts)) is None:
-            yield None
-        else:
-            with pin as path:
-                yield path
+            return nullcontext(path)
+        if (placed := self._known_as(name)) is None:
+            return None
+        if (path := self.storage.in_place(placed.key)) is not None:
+            return nullcontext(path)
+        return self._cached(placed, counts=counts)
 
     def fetch(self, name: str) -> Path:
         """The file of the scene, on this host from now on. Raises FileNotFoundError, StorageFull."""

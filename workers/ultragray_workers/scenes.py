@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -130,15 +130,12 @@ class SceneStore:
         header = self._headers.get(name, version)
         return None if header is None else (version, header)
 
-    @contextmanager
-    def hold(self, name: str) -> Iterator[Path | None]:
-        """The file of a scene, which stays on this host during the body; None where it is not on this host now."""
+    def hold(self, name: str) -> AbstractContextManager[Path] | None:
+        """The file of a scene, which stays on this host until the context is left; None where it is not here now."""
         for shelf in self.shelves if is_scene_name(name) else ():
-            with shelf.hold(name) as path:
-                if path is not None or shelf.knows(name):
-                    yield path
-                    return
-        yield None
+            if (held := shelf.hold(name)) is not None or shelf.knows(name):
+                return held
+        return None
 
     def sha256(self, text: str) -> str:
         """The hash of the content that a scene has now, its file fetched where nothing else tells it.

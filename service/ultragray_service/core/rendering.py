@@ -45,7 +45,6 @@ from ultragray_workers.errors import NotReady, SceneNotFound
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
-from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
 
@@ -187,6 +186,45 @@ class RequestPlanner:
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
 
 
+class Asked(Generic[S]):
+    """Frames that wait for their turn, or are rendered. A context manager, which ends that.
+
+    They are asked for again where the scene's file has changed by their turn.
+    """
+
+    def __init__(self, pool: RenderPool, plan: Plan[S], request: RenderRequest[S], settings: S | None) -> None:
+        """`settings`: in place of those of the plan."""
+        self._pool, self._plan, self._settings = pool, plan, settings
+        self._turn = pool.ask(request)
+
+    def give_to(self, poses: FloatArray, deadline: float | None) -> bool:  # [C, 4, 4] mm
+        """Has other poses rendered in place of those that wait, as many of them; False where that is too late."""
+        return self._turn.give_to(poses, deadline)
+
+    async def frames(self) -> RenderResult[S]:
+        """Waits for them, once. Raises what RenderPool.render and Plan.renew raise."""
+        for _ in range(MAX_SCENE_CHANGES):
+            try:
+                with scene_to_blame():
+                    return await self._pool.frames(self._turn)
+            except SceneChangedError:
+                await self._plan.renew()
+                plan, newest = self._plan, self._turn.request
+                settings = _breathed(self._settings or plan.settings, plan)
+                self.close()
+                self._turn = self._pool.ask(replace(newest, settings=settings, version=plan.version))
+        raise RenderFailed(f"scene {self._plan.scene!r} kept changing while it was being rendered", field="scene")
+
+    def close(self) -> None:
+        self._turn.close()
+
+    def __enter__(self) -> Asked[S]:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
 class Rendering:
     def __init__(
         self, pool: RenderPool, planner: RequestPlanner, life: Life, owners: Owners, limits: Limits, metrics: Metrics
@@ -206,39 +244,55 @@ class Rendering:
         *,
         deadline: float | None,  # time.monotonic() in seconds
         priority: Priority = Priority.INTERACTIVE,
-        turn: Turn | None = None,
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
         destination: Destination | None = None,
         settings: S | None = None,  # in place of the plan's: a part of it
     ) -> RenderResult[S]:
         """Renders for the scene that is there by then. Raises what RenderPool.render and Plan.renew raise."""
+        asked = self.ask(
+            plan,
+            poses,
+            deadline=deadline,
+            priority=priority,
+            begin_by=begin_by,
+            destination=destination,
+            settings=settings,
+        )
+        with asked:
+            return await asked.frames()
+
+    def ask(
+        self,
+        plan: Plan[S],
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        *,
+        deadline: float | None,  # time.monotonic() in seconds
+        priority: Priority = Priority.INTERACTIVE,
+        begin_by: float | None = None,  # likewise
+        destination: Destination | None = None,
+        settings: S | None = None,
+    ) -> Asked[S]:
+        """As `render`, which waits for the frames: has them wait for their turn at once. Raises what RenderPool.ask
+        raises, and SceneNotFound.
+        """
         self.life.require_serving()
         mine = account()
         mine.target = plan.scene
         mine.frames += len(poses)
         if self._owners.hides(Kind.SCENE, plan.scene):  # since a stream began, for example
             raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
-        turn = turn or Turn()
-        for _ in range(MAX_SCENE_CHANGES):
-            request = RenderRequest(
-                plan.scene,
-                _breathed(settings or plan.settings, plan),
-                poses,
-                priority,
-                deadline,
-                plan.version,
-                caller(),
-                begin_by,
-                destination,
-            )
-            try:
-                with scene_to_blame():
-                    return await self.pool.render(request, turn)
-            except SceneChangedError:
-                if turn.ticket is not None:  # perhaps with newer poses
-                    poses, deadline = turn.ticket.request.poses, turn.ticket.request.deadline
-                await plan.renew()
-        raise RenderFailed(f"scene {plan.scene!r} kept changing while it was being rendered", field="scene")
+        request = RenderRequest(
+            plan.scene,
+            _breathed(settings or plan.settings, plan),
+            poses,
+            priority,
+            deadline,
+            plan.version,
+            caller(),
+            begin_by,
+            destination,
+        )
+        return Asked(self.pool, plan, request, settings)
 
     async def render_slice(
         self, plan: Plan[SliceView], pose: FloatArray, *, deadline: float | None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass, field, replace
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from typing import Any, Protocol
@@ -16,14 +16,13 @@ from ultragray.geometry.motion import MAX_AHEAD_MS, PathPredictor, Prediction
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.pixels import EncodedFrame
 from ultragray.rendering.preview import Preview
-from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings, Resolved
 from ultragray_service.core.clocks import ClientClock, ClockStamps, service_time_s
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.previews import RealFrame, StreamPreview
-from ultragray_service.core.rendering import Plan, Rendering
+from ultragray_service.core.rendering import Asked, Plan, Rendering
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult
-from ultragray_workers.pool.waiting import Turn
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
@@ -61,10 +60,15 @@ class PoseRequest:
 Write = Callable[[StreamAnswer], Awaitable[None]]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Underway:
-    work: asyncio.Task[StreamAnswer]
-    sent: Callable[[], None]
+    """An answer on its way, in its place among those of its stream: to a pose, or to a message that gets no frame."""
+
+    sequence: int
+    client_time: float | None
+    frames: Asked[Resolved] | UltragrayError  # or why there are none
+    left: Callable[[], None]  # called when it has been written
+    request: PoseRequest | None = None  # the newest that its frame is for
 
 
 class _Room:
@@ -132,14 +136,13 @@ class PoseStream:
         self._record = record or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
-        self._started: set[asyncio.Task[StreamAnswer]] = set()
+        self._unanswered: set[_Underway] = set()
         self._ended = False  # no more poses come
         self._dropped = 0
-        # Of a latest stream: what is asked of the pool, its place in the queue, and what comes after it.
-        self._current: PoseRequest | None = None
-        self._is_waiting = False  # for the limits of its key to allow it
-        self._turn = Turn()
+        # Of a latest stream: what is asked of the pool, and what comes after it.
+        self._current: _Underway | None = None
         self._next: PoseRequest | None = None
+        self._waiting: asyncio.Task[None] | None = None  # for the limits of its key to allow the next one
         self._window = _Window()
 
     async def run(self, read: Callable[[], Awaitable[None]], send: Write, hand_over: Write) -> None:
@@ -166,22 +169,30 @@ class PoseStream:
                 raise Draining("the service is stopping; the frames in flight have been answered")
         finally:
             self._rendering.metrics.count_stream(-1)
-            tasks = [reader, writer, stopping, *self._started]
+            tasks = [reader, writer, stopping, *([] if self._waiting is None else [self._waiting])]
             for task in tasks:
                 task.cancel()
-            self._answers = asyncio.Queue()  # with the frames that nobody takes any more
             await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
+            self._answers = asyncio.Queue()
+            while self._unanswered:
+                _close(self._unanswered.pop())
             tasks.clear()
             del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
 
     async def ask(self, request: PoseRequest) -> None:
-        """Takes a pose. An ordered stream waits while too many frames are in flight."""
+        """Takes a pose. An ordered stream waits while too many frames are in flight, or its key may have none yet."""
         self._record.count_pose()
         if self.mode is StreamMode.ORDERED:
             settings = request.plan.settings
             size = settings.pixels * settings.encoding.pixel_type.itemsize
             await self._room.enter(size)
-            self._start(self._answer(request), sent=partial(self._room.leave, size))
+            try:
+                await self._rendering.limits.frame_turn(request.deadline)
+            except UltragrayError as error:
+                frames: Asked[Resolved] | UltragrayError = self._refused(error)
+            else:
+                frames = self._asked(request)
+            self._begin(request, frames, left=partial(self._room.leave, size))
             return
         if self._next is None and self._take_over(request):
             self._count_dropped()
@@ -200,13 +211,10 @@ class PoseStream:
 
     async def refuse(self, sequence: int, client_time: float | None, error: UltragrayError) -> None:
         """Takes a message that gets no frame. Waits while too many answers are under way."""
-
-        async def refusal() -> StreamAnswer:
-            return StreamAnswer(sequence, client_time, error)
-
-        self._rendering.metrics.count_frame_error(error)
         await self._room.enter(0)
-        self._start(refusal(), sent=partial(self._room.leave, 0))
+        self._answers.put_nowait(
+            _Underway(sequence, client_time, self._refused(error), left=partial(self._room.leave, 0))
+        )
 
     async def _read(self, read: Callable[[], Awaitable[None]]) -> None:
         try:
@@ -217,106 +225,123 @@ class PoseStream:
 
     async def _write(self, send: Write, hand_over: Write) -> None:
         while (underway := await self._answers.get()) is not None:
-            answer = await underway.work
-            dropped, self._dropped = self._dropped, 0
-            answer = replace(answer, dropped=dropped, clock=self.clock.offset(service_time_s()))
+            answer = await self._answer(underway)
             self._record.note(answer)
             write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
             await write(answer)
-            underway.sent()
+            underway.left()
 
-    def _start(self, work: Coroutine[Any, Any, StreamAnswer], sent: Callable[[], None]) -> None:
-        task = asyncio.create_task(work)
-        self._started.add(task)
-        task.add_done_callback(self._started.discard)
-        self._answers.put_nowait(_Underway(task, sent))
-
-    async def _answer(self, request: PoseRequest) -> StreamAnswer:
-        return await self._answer_to(request, await self._outcome(self._rendered(request)))
-
-    async def _answer_to(self, request: PoseRequest, outcome: RenderResult | UltragrayError) -> StreamAnswer:
-        answer = StreamAnswer(
-            request.sequence,
-            request.client_time,
+    async def _answer(self, underway: _Underway) -> StreamAnswer:
+        """Waits for a frame. That of a latest stream makes way for the next pose before it is written."""
+        outcome, preview = await self._outcome(underway), None
+        request = underway.request
+        if underway is self._current:
+            assert request is not None
+            self._current = None
+            self._window.enter(request.sequence)
+            self._advance()
+        if request is not None and request.correct is not None and not isinstance(outcome, UltragrayError):
+            outcome, preview = await request.correct(outcome)
+        dropped, self._dropped = self._dropped, 0
+        asked = underway if request is None else request
+        return StreamAnswer(
+            asked.sequence,
+            asked.client_time,
             outcome,
-            prediction=request.prediction,
-            measured_s=request.measured_s,
-        )
-        if request.correct is None or isinstance(outcome, UltragrayError):
-            return answer
-        shown, preview = await request.correct(outcome)
-        return replace(answer, outcome=shown, preview=preview)
-
-    async def _rendered(self, request: PoseRequest) -> RenderResult:
-        await self._rendering.limits.frame_turn(request.deadline)
-        return await self._render(request, Turn())
-
-    async def _render(self, request: PoseRequest, turn: Turn) -> RenderResult:
-        destination = self.destination if request.correct is None else None  # its pixels are made here
-        return await self._rendering.render(
-            request.plan, request.pose[None], deadline=request.deadline, turn=turn, destination=destination
+            dropped,
+            prediction=None if request is None else request.prediction,
+            preview=preview,
+            measured_s=None if request is None else request.measured_s,
+            clock=self.clock.offset(service_time_s()),
         )
 
-    async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
+    async def _outcome(self, underway: _Underway) -> RenderResult | UltragrayError:
+        frames = underway.frames
+        if isinstance(frames, UltragrayError):
+            return frames
         try:
-            return await rendering
+            return await frames.frames()
         except UltragrayError as error:
-            outcome = error
+            return self._refused(error)
         except Exception as error:
-            outcome = unexpected(error)
-        self._rendering.metrics.count_frame_error(outcome)
-        return outcome
+            return self._refused(unexpected(error))
+        finally:
+            frames.close()
+            self._unanswered.discard(underway)
+
+    def _asked(self, request: PoseRequest) -> Asked[Resolved] | UltragrayError:
+        """The frame of a pose, which waits in the pool from now on; else why there will be none."""
+        destination = self.destination if request.correct is None else None  # its pixels are made here
+        try:
+            return self._rendering.ask(
+                request.plan, request.pose[None], deadline=request.deadline, destination=destination
+            )
+        except UltragrayError as error:
+            return self._refused(error)
+        except Exception as error:
+            return self._refused(unexpected(error))
+
+    def _begin(
+        self, request: PoseRequest, frames: Asked[Resolved] | UltragrayError, left: Callable[[], None]
+    ) -> _Underway:
+        underway = _Underway(request.sequence, request.client_time, frames, left, request)
+        self._unanswered.add(underway)
+        self._answers.put_nowait(underway)
+        return underway
+
+    def _refused(self, error: UltragrayError) -> UltragrayError:
+        self._rendering.metrics.count_frame_error(error)
+        return error
 
     def _take_over(self, request: PoseRequest) -> bool:
-        """Puts a pose into the place of the one that is not begun: it waits for its key's limits, or in the pool."""
+        """Puts a pose into the place of the one that waits in the pool, if that is not begun."""
         current = self._current
-        if self._is_waiting:
-            self._current = request
-            return True
-        if (
-            current is None
-            or current.plan is not request.plan
-            or (current.correct is None) != (request.correct is None)
-        ):
+        if current is None or current.request is None or isinstance(current.frames, UltragrayError):
             return False
-        if not self._turn.give_to(request.pose[None], request.deadline):
+        if current.request.plan is not request.plan or (current.request.correct is None) != (request.correct is None):
             return False
-        self._current = request
+        if not current.frames.give_to(request.pose[None], request.deadline):
+            return False
+        current.request = request
         return True
 
     def _advance(self) -> None:
         """Asks the pool for what comes next, once it may; ends the answers after the last one."""
         has_room = self._window.has_room or self._ended  # a client that has ended cannot acknowledge any more
-        if self._next is not None and self._current is None and has_room:
-            self._current, self._next, self._turn = self._next, None, Turn()
-            self._start(self._answer_latest(), sent=self._sent_latest)
+        if self._next is not None and self._current is None and self._waiting is None and has_room:
+            if self._rendering.limits.mine.frames_per_s is None:
+                self._ask_next()
+            else:
+                self._waiting = asyncio.create_task(self._ask_next_in_turn())
         if self._ended and self._next is None:
             self._answers.put_nowait(None)
 
-    async def _answer_latest(self) -> StreamAnswer:
-        outcome = await self._outcome(self._rendered_latest())
-        assert self._current is not None
-        request, self._current = self._current, None  # perhaps a later one than at the start
-        self._window.enter(request.sequence)
-        self._advance()
-        return await self._answer_to(request, outcome)
-
-    async def _rendered_latest(self) -> RenderResult:
-        self._is_waiting = True
+    async def _ask_next_in_turn(self) -> None:
         try:
             await self._rendering.limits.frame_turn(None)  # meanwhile newer poses, with later deadlines, may come
         finally:
-            self._is_waiting = False
-        assert self._current is not None
-        return await self._render(self._current, self._turn)
+            self._waiting = None
+        self._ask_next()
+        if self._ended:
+            self._answers.put_nowait(None)
 
-    def _sent_latest(self) -> None:
+    def _ask_next(self) -> None:
+        assert self._next is not None
+        request, self._next = self._next, None
+        self._current = self._begin(request, self._asked(request), left=self._left_latest)
+
+    def _left_latest(self) -> None:
         self._window.sent()
         self._advance()
 
     def _count_dropped(self) -> None:
         self._dropped += 1
         self._rendering.metrics.count_dropped()
+
+
+def _close(underway: _Underway) -> None:
+    if not isinstance(underway.frames, UltragrayError):
+        underway.frames.close()
 
 
 def unexpected(error: Exception) -> UltragrayError:

@@ -19,6 +19,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.rendering.display import true_to_scale
 from ultragray.rendering.settings import Encoding, Resolved, settings_used
 from ultragray.scene.confidence import Extrapolation
+from ultragray_service.core.rendering import Asked
 from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
@@ -36,7 +37,6 @@ from ultragray_service.service import Service
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.owners import Kind, Ownership
 from ultragray_workers.pool.messages import RenderResult
-from ultragray_workers.pool.waiting import Turn
 
 MAX_WAITING_DEVICES = 16
 
@@ -57,7 +57,7 @@ class Underway:
     """A request to the render pool; while it waits there, a newer pose takes its turn, unless the setup has changed."""
 
     posed: PoseMessage
-    turn: Turn
+    asked: Asked | None = None  # once it waits there
     setup: Setup | None = None  # that it is rendered with, once that is known
     registration: Registration | None = None  # likewise
 
@@ -67,7 +67,9 @@ class Underway:
 
     def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
         """Whether a newer pose, of a client with that setup now, has taken the turn."""
-        if self.setup is not setup or not self.turn.give_to(self._placed(posed.pose)[None], deadline):
+        if self.setup is not setup or self.asked is None:
+            return False
+        if not self.asked.give_to(self._placed(posed.pose)[None], deadline):
             return False
         self.posed = replace(posed, replaced=self.posed.replaced + 1)
         return True
@@ -120,7 +122,7 @@ class WaitingPoses:
             await self._come.wait()
 
     def take(self) -> Underway:
-        self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
+        self._underway = Underway(self._poses.pop(next(iter(self._poses))))
         return self._underway
 
     async def settled(self) -> None:
@@ -213,7 +215,8 @@ async def render_frame(service: Service, scenes: SceneChooser, scanner: Scanner,
 
     plan = await service.planner.plan(scene, asked, Encoding.UINT8, complete=complete)
     deadline = service.planner.deadline(None)
-    result = await service.rendering.render(plan, underway.pose[None], deadline=deadline, turn=underway.turn)
+    with service.rendering.ask(plan, underway.pose[None], deadline=deadline) as underway.asked:
+        result = await underway.asked.frames()
     return Frame(underway.posed, result, image_of(result, found), ownership, found)
 
 

@@ -399,7 +399,7 @@ class FakeTurn:
 
 
 def waits_in_the_pool(underway):
-    underway.turn, underway.setup = (turn := FakeTurn()), SETUP
+    underway.asked, underway.setup = (turn := FakeTurn()), SETUP
     return turn
 
 

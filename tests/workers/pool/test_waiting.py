@@ -11,7 +11,7 @@ from ultragray.rendering.settings import Encoding
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers import Priority
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
+from ultragray_workers.pool.waiting import Deadlines, Part, Ticket, WaitingQueue
 
 from ..asking import asking
 
@@ -160,32 +160,16 @@ def test_what_is_past_its_deadline_is_dropped(make_ticket):
     assert queue.frames == 0
 
 
-def test_a_newer_pose_takes_the_place_of_one_that_waits(make_ticket):
-    queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
-    first, second = make_ticket(), make_ticket()
-    turn = Turn()
-    newer = np.tile(2 * np.eye(4), (1, 1, 1))
-    assert not turn.give_to(newer, None)  # it has no place yet
-    turn.ticket = first
-    queue.add(first)
-    queue.add(second)
-    assert turn.give_to(newer, 1e9)
-    assert queue.frames == 2
-    assert taken(queue) == [(first, 0, 1)]
-    assert first.request.poses is newer
-    assert first.request.deadline == 1e9
-    assert not turn.give_to(np.eye(4)[None], None)  # it is being rendered
-    assert first.request.poses is newer
-
-
 @pytest.mark.parametrize("first_s", [60.0, 0.02], ids=["brought forward", "put off"])
 def test_a_deadline_that_was_moved_expires_when_it_says_now(make_ticket, clock, first_s):
     async def wait():
         queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        deadlines = Deadlines(queue)
         ticket = make_ticket(deadline=time.monotonic() + first_s)
         queue.add(ticket)
-        turn = Turn(ticket, Expiry(ticket, queue))
-        assert turn.give_to(np.eye(4)[None], time.monotonic() + 0.1)
+        deadlines.watch(ticket)
+        ticket.request = replace(ticket.request, deadline=time.monotonic() + 0.1)
+        deadlines.watch(ticket)
         await asyncio.sleep(0.05)
         assert queue.frames == 1
         await asyncio.sleep(0.1)
@@ -210,17 +194,17 @@ def test_what_has_not_begun_in_time_is_refused_and_what_has_goes_on(make_ticket,
     async def main():
         queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
         begun, waits = make_ticket(2), make_ticket()
+        deadlines = Deadlines(queue)
         for ticket in (begun, waits):
             ticket.request = replace(ticket.request, begin_by=time.monotonic() + 0.2)
             ticket.done = asyncio.get_running_loop().create_future()
             queue.add(ticket)
-        expiries = [Expiry(ticket, queue) for ticket in (begun, waits)]
+            deadlines.watch(ticket)
         begun.memory = 0  # a worker has the first part of it
         with pytest.raises(QueueFull, match="max_queue_ms"):
             await waits.done
         assert not begun.done.done()
         assert queue.frames == 2
-        for expiry in expiries:
-            expiry.cancel()
+        deadlines.close()
 
     clock.run_until_complete(main())

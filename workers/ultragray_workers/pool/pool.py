@@ -12,11 +12,13 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ultragray.errors import InvalidArgument, RenderFailed
+from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import Draining, NotReady
@@ -36,7 +38,7 @@ from ultragray_workers.pool.messages import (
     reply_bytes,
 )
 from ultragray_workers.pool.processes import Launcher
-from ultragray_workers.pool.waiting import Expiry, Ticket, Turn, WaitingQueue
+from ultragray_workers.pool.waiting import Deadlines, Ticket, WaitingQueue
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
 
@@ -59,6 +61,37 @@ class PoolStatistics:
     stuck: int  # processes that have told nothing of their work for some seconds
     pids: tuple[int, ...]  # of the processes that are alive
     renderer: str | None  # of the frame that was rendered last
+
+
+class Turn:
+    """A request's place in the queue, which newer poses may take while it waits. A context manager, which closes it."""
+
+    def __init__(self, pool: RenderPool, request: RenderRequest[Any]) -> None:
+        self.request = request  # with the newest poses
+        self.ticket: Ticket | None = None  # None while the file of its scene is not on this host
+        self.held: AbstractContextManager[Path] | None = None  # that file
+        self._pool = pool
+
+    def give_to(self, poses: FloatArray, deadline: float | None) -> bool:  # [C, 4, 4] mm
+        """Has other poses rendered in place of those that wait, as many of them; False where that is too late."""
+        ticket = self.ticket
+        if ticket is None or not ticket.untouched:
+            return False
+        assert len(poses) == len(self.request.poses)
+        self.request = ticket.request = replace(self.request, poses=poses, deadline=deadline)
+        ticket.submitted = time.monotonic()
+        self._pool.deadlines.watch(ticket)
+        return True
+
+    def close(self) -> None:
+        """Ends the rendering, unless it is done, and gives back what it took."""
+        self._pool.close_turn(self)
+
+    def __enter__(self) -> Turn:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 class RenderPool:
@@ -84,9 +117,9 @@ class RenderPool:
             config,
             self._waiting,
         )
-        self._open: set[Ticket] = set()
+        self.deadlines = Deadlines(self._waiting)
+        self._turns: set[Turn] = set()  # that are not closed
         self._renderer: str | None = None
-        self._active = 0  # calls of render() under way
         self._all_answered = asyncio.Event()
         self._started = False
         self._draining = False
@@ -110,16 +143,15 @@ class RenderPool:
             raise
         self._started = True
 
-    async def render(self, request: RenderRequest[S], turn: Turn | None = None) -> RenderResult[S]:
+    async def render(self, request: RenderRequest[S]) -> RenderResult[S]:
         """Renders the request as soon as its turn comes; cancelling the caller, and its deadline, end the rendering.
 
-        With `turn` its poses can be replaced by newer ones as long as they wait. Raises NotReady, Draining, QueueFull,
-        DeadlineExceeded, InvalidArgument, FrameTooCostly, SceneNotFound, SceneFileInvalid, SceneTooLarge,
-        MemoryExceeded, RenderFailed; SceneChangedError where the request is for another version of the scene's file.
+        Raises NotReady, Draining, QueueFull, DeadlineExceeded, InvalidArgument, FrameTooCostly, SceneNotFound,
+        SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed; SceneChangedError where the request is for
+        another version of the scene's file.
         """
-        result = await self._answered(request, turn or Turn(), _frames)
-        self.on_rendered(result)
-        return result
+        with self.ask(request) as turn:
+            return await self.frames(turn)
 
     async def search(self, request: RenderRequest[Search]) -> SearchResult[Any]:
         """Looks for a real frame about the pose of the request, or for views; its turn comes, and ends, as that of a
@@ -127,29 +159,73 @@ class RenderPool:
 
         Raises what `render` raises; InvalidArgument and InvalidImageSize also for pixels that are no frame.
         """
-        return await self._answered(request, Turn(), _what_was_found)
+        with self.ask(request) as turn:
+            return await self._answer(turn, _what_was_found)
 
-    async def _answered(
-        self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
-    ) -> R:
-        """What `read` makes of the answer to a request, while the memory of the answer is there."""
+    def ask(self, request: RenderRequest[Any]) -> Turn:
+        """Puts a request into the queue at once; the caller closes its turn, answered or not.
+
+        Raises NotReady, Draining, QueueFull, InvalidArgument.
+        """
         self._check_accepting()
-        self._active += 1
+        turn = Turn(self, request)
+        self._turns.add(turn)
         self._all_answered.clear()
         try:
-            for _ in range(MAX_SCENE_CHANGES):
-                try:
-                    return await self._answer(request, turn, read)
-                except SceneChangedError:
-                    if request.version is not None:
-                        raise
-                    if turn.ticket is not None:
-                        request = turn.ticket.request  # perhaps with newer poses
-            raise RenderFailed(f"scene {request.scene!r} kept changing while it was being rendered", field="scene")
-        finally:
-            self._active -= 1
-            if self._active == 0:
-                self._all_answered.set()
+            self._queue(turn)
+        except BaseException:
+            turn.close()
+            raise
+        return turn
+
+    async def frames(self, turn: Turn) -> RenderResult[Any]:
+        """Waits for the frames of a turn, once. Raises what `render` raises."""
+        result = await self._answer(turn, _frames)
+        asyncio.get_running_loop().call_soon(self.on_rendered, result)  # the caller has its frame first
+        return result
+
+    async def _answer(self, turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]) -> R:
+        """What `read` makes of the answer to a request, while the memory of the answer is there."""
+        for _ in range(MAX_SCENE_CHANGES):
+            try:
+                if turn.ticket is None:  # fetches the file of the scene, or raises that there is none
+                    await asyncio.to_thread(self._store.path, turn.request.scene)
+                    raise SceneChangedError
+                rendered = await turn.ticket.done
+                self._renderer = rendered.renderer
+                return await read(turn.ticket, rendered)
+            except SceneChangedError:
+                if turn.request.version is not None:
+                    raise
+                self._leave(turn)
+                self._queue(turn)
+        raise RenderFailed(f"scene {turn.request.scene!r} kept changing while it was being rendered", field="scene")
+
+    def _queue(self, turn: Turn) -> None:
+        """Makes a ticket for a turn, unless the file of its scene is not on this host now."""
+        if (held := self._store.hold(turn.request.scene)) is None:
+            return
+        turn.held = held
+        turn.ticket = ticket = _ticket(turn.request, held.__enter__())
+        self.deadlines.watch(ticket)
+        self._dispatcher.submit(ticket)
+
+    def close_turn(self, turn: Turn) -> None:
+        self._leave(turn)
+        self._turns.discard(turn)
+        if not self._turns:
+            self._all_answered.set()
+
+    def _leave(self, turn: Turn) -> None:
+        ticket, turn.ticket = turn.ticket, None
+        if ticket is not None:
+            self.deadlines.forget(ticket)
+            if not (ticket.done.cancel() or ticket.done.cancelled()):
+                ticket.done.exception()  # which nobody may have asked for
+            self._dispatcher.discard(ticket)
+        held, turn.held = turn.held, None
+        if held is not None:
+            held.__exit__(None, None, None)
 
     async def load(self, scene: str) -> None:
         """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
@@ -157,10 +233,10 @@ class RenderPool:
         name = base_name(scene)
         for _ in range(MAX_SCENE_CHANGES):
             await asyncio.to_thread(self._store.path, scene)
-            with self._store.hold(name) as path:
-                if path is not None:
+            if (held := self._store.hold(name)) is not None:
+                with held as path:
                     await self._dispatcher.command_all(LoadTask(name, str(path)))
-                    return
+                return
         raise RenderFailed(f"scene {scene!r} kept changing while it was being loaded", field="scene")
 
     async def unload(self, scene: str) -> None:
@@ -192,63 +268,32 @@ class RenderPool:
     async def drain(self, timeout_s: float) -> None:
         """Refuses new requests and returns when all earlier ones are answered, or after the timeout."""
         self._draining = True
-        if self._active:
+        if self._turns:
             try:
                 await asyncio.wait_for(self._all_answered.wait(), timeout_s)
             except asyncio.TimeoutError:
-                logger.warning("%d requests were not answered within %g s of draining", self._active, timeout_s)
+                logger.warning("%d requests were not answered within %g s of draining", len(self._turns), timeout_s)
 
     async def close(self) -> None:
         """Ends all processes, and requests that are still open with Draining."""
         self._draining = True
         self._closed = True
-        for ticket in list(self._open):
-            self._waiting.remove(ticket)
-            ticket.fail(Draining("the service is stopping"))
+        for turn in self._turns:
+            if turn.ticket is not None:
+                self._waiting.remove(turn.ticket)
+                turn.ticket.fail(Draining("the service is stopping"))
         self._launcher.abandon_starting()
         await self._dispatcher.close()
         await self._launcher.close()
-        if self._active:
+        if self._turns:
             await self._all_answered.wait()
+        self.deadlines.close()
 
     def _check_accepting(self) -> None:
         if self._draining:
             raise Draining("the service is stopping; it takes no new requests")
         if not self._started:
             raise NotReady("the service is starting; try again in a few seconds")
-
-    async def _answer(
-        self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
-    ) -> R:
-        with self._store.hold(request.scene) as path:
-            if path is None:
-                await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
-                raise SceneChangedError
-            turn.ticket = ticket = self._ticket(request, path)
-            turn.expiry = Expiry(ticket, self._waiting)
-            try:
-                self._open.add(ticket)
-                self._dispatcher.submit(ticket)
-                rendered = await ticket.done
-                self._renderer = rendered.renderer
-                return await read(ticket, rendered)
-            finally:
-                turn.expiry.cancel()
-                self._open.discard(ticket)
-                self._dispatcher.discard(ticket)
-
-    def _ticket(self, request: RenderRequest[Any], path: Path) -> Ticket:
-        """Raises InvalidArgument for a request that no reply can hold."""
-        if not len(request.poses):
-            raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
-        if not isinstance(request.settings, Search):
-            _check_reply(request.settings, len(request.poses))
-        return Ticket(
-            request=request,
-            path=str(path),
-            done=asyncio.get_running_loop().create_future(),
-            submitted=time.monotonic(),
-        )
 
 
 def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
@@ -262,6 +307,15 @@ def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
             f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {size}",
             field="poses",
         )
+
+
+def _ticket(request: RenderRequest[Any], path: Path) -> Ticket:
+    """Raises InvalidArgument for a request that no reply can hold."""
+    if not len(request.poses):
+        raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
+    if not isinstance(request.settings, Search):
+        _check_reply(request.settings, len(request.poses))
+    return Ticket(request, str(path), asyncio.get_running_loop().create_future(), submitted=time.monotonic())
 
 
 async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:

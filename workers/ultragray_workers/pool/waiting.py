@@ -7,11 +7,10 @@ import math
 import time
 from collections import OrderedDict, deque
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
 
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
@@ -87,26 +86,6 @@ class Ticket:
     def fail(self, error: Exception) -> None:
         if not self.done.done():
             self.done.set_exception(error)
-
-
-@dataclass(eq=False)
-class Turn:
-    """One caller's place in the queue, which a newer pose may take while it waits."""
-
-    ticket: Ticket | None = None  # None until the request is queued
-    expiry: Expiry | None = None
-
-    def give_to(self, poses: FloatArray, deadline: float | None) -> bool:
-        """Has other poses rendered in place of those that wait, as many of them; False where that is too late."""
-        ticket = self.ticket
-        if ticket is None or not ticket.untouched:
-            return False
-        assert len(poses) == len(ticket.request.poses)
-        ticket.request = replace(ticket.request, poses=poses, deadline=deadline)
-        ticket.submitted = time.monotonic()
-        if self.expiry is not None:
-            self.expiry.watch()
-        return True
 
 
 @dataclass(eq=False)
@@ -373,27 +352,39 @@ def _no_room(whose: str, waiting: int, count: int, limit: int) -> str:
     return f"{waiting} frames wait {whose} and {count} more would exceed the limit of {limit}; try again shortly"
 
 
-class Expiry:
-    """Fails a ticket at its deadline, should its frames not be ready, or not begun, by then."""
+class Deadlines:
+    """Fails tickets at their deadlines, should their frames not be ready, or not begun, by then.
 
-    def __init__(self, ticket: Ticket, queue: WaitingQueue) -> None:
-        self._ticket, self._queue = ticket, queue
+    One timer serves them all: it is set for the earliest, and most tickets are answered before it goes off.
+    """
+
+    def __init__(self, queue: WaitingQueue) -> None:
+        self._queue = queue
+        self._tickets: set[Ticket] = set()
         self._timer: asyncio.TimerHandle | None = None
-        self.watch()
+        self._next_look = math.inf  # time.monotonic(), s
 
-    def watch(self) -> None:
-        self.cancel()
-        give_up_at = self._ticket.give_up_at
-        if give_up_at < math.inf:
-            delay_s = max(0.0, give_up_at - time.monotonic())
-            self._timer = asyncio.get_running_loop().call_later(delay_s, self._look)
+    def watch(self, ticket: Ticket) -> None:
+        """From now on; again where its deadline has changed."""
+        self._tickets.add(ticket)
+        self._look_by(ticket.give_up_at)
 
-    def _look(self) -> None:
-        if self._ticket.expired:
-            self._queue.expire(self._ticket)
-        else:  # it has begun, or the timer was a little early
-            self.watch()
+    def forget(self, ticket: Ticket) -> None:
+        self._tickets.discard(ticket)
 
-    def cancel(self) -> None:
+    def close(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
+
+    def _look_by(self, at: float) -> None:
+        if at < self._next_look:
+            self.close()
+            self._next_look = at
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, at - time.monotonic()), self._look)
+
+    def _look(self) -> None:
+        self._next_look = math.inf
+        for ticket in list(self._tickets):
+            self._queue.expire(ticket)
+            if not ticket.done.done():  # it has begun, or the timer was a little early
+                self._look_by(ticket.give_up_at)
