@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey, Tls
+from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey, Tls, is_local
 from ultragray_client.contract import (
     Dataset,
     DatasetOptions,
@@ -484,7 +484,7 @@ class _Client(Group[AnyConnection]):
         *,
         mode: StreamMode | str = "ordered",
         timeout_s: float | None = None,
-        shared_memory: bool = False,
+        shared_memory: bool | None = None,
         reconnect_s: float | None = None,
         seen_after_ms: float | None = None,
     ) -> PoseStream:
@@ -499,15 +499,17 @@ class _Client(Group[AnyConnection]):
 
         `shared_memory`: pixels come through memory that is shared with the service, and messages through a socket,
         instead of the connection: the fastest way to a frame. It takes a Linux host that both run on, as the same user,
-        and a loopback `address`; else InvalidArgument. The arrays of a frame are views of that memory, and stay as they
-        are for as long as anything refers to one of them. While 16 frames are held, others come in their messages, as
-        do those of more than 16 MiB.
+        and a loopback `address`. None: where that is so; True: else InvalidArgument; False: over the connection. The
+        arrays of a frame are views of that memory, and stay as they are for as long as anything refers to one of them.
+        While 16 frames are held, others come in their messages, as do those of more than 16 MiB.
 
         `seen_after_ms`, 0 to `MAX_AHEAD_MS`: frames are those of where the probe will be when they are seen, so long
         after they arrive here; None: of the poses as they were sent. A pose is foretold from those before it and their
         `measured_ns`, for the median latency of the last frames; `frame.pose` is where, and `frame.prediction` says
         how far ahead that is, and how wrong it is expected to be.
         """
+        if shared_memory is None and not is_local(self._connection.address):
+            shared_memory = False
         exchange = PoseExchange(
             settings_message(scene, settings), mode, shared_memory=shared_memory, seen_after_ms=seen_after_ms
         )

@@ -324,7 +324,7 @@ def target_of(address: str, tls: Tls | None) -> tuple[str, Tls | None]:
 
 def warn_of_open_key(address: str) -> None:
     """Warns, once for each place that makes such a client, that others on the way can read its key."""
-    if not _is_local(address):
+    if not is_local(address):
         warnings.warn(
             f"the API key travels unencrypted to {address}, and whoever is on the way can read it: give tls=Tls(...)",
             UserWarning,
@@ -332,7 +332,8 @@ def warn_of_open_key(address: str) -> None:
         )
 
 
-def _is_local(address: str) -> bool:
+def is_local(address: str) -> bool:
+    """Whether an address is one of this host alone."""
     if address.startswith(_LOCAL_SCHEMES):
         return True
     found = _TARGET.match(address)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from ultragray_client.connection import error_of_frame
 from ultragray_client.contract import MAX_AHEAD_MS
-from ultragray_client.errors import Draining, InvalidArgument
+from ultragray_client.errors import ClientError, Draining, InvalidArgument
 from ultragray_client.frames import Frame, frame_from_message, image_fields
 from ultragray_client.geometry import PoseLike, pose_message
 from ultragray_proto.v1 import rendering_pb2
@@ -147,11 +147,13 @@ class PoseExchange:
         settings: rendering_pb2.RenderSettings,
         mode: StreamMode | str,
         *,
-        shared_memory: bool = False,
+        shared_memory: bool | None = False,
         seen_after_ms: float | None = None,
     ) -> None:
-        """Raises InvalidArgument for a mode that does not exist, a `seen_after_ms` out of range, and where this system
-        cannot share memory.
+        """`shared_memory` None: where this system and the service can share it.
+
+        Raises InvalidArgument for a mode that does not exist, a `seen_after_ms` out of range, and where this system
+        cannot share memory that is asked for.
         """
         if seen_after_ms is not None and not 0.0 <= seen_after_ms <= MAX_AHEAD_MS:
             raise InvalidArgument(
@@ -167,7 +169,8 @@ class PoseExchange:
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._sequence = 0
         self._dropped = 0
-        self._memory = SharedMemory() if shared_memory else None
+        self._needs_memory = shared_memory is True
+        self._memory = None if shared_memory is False else self._new_memory()
         self._is_open = False
         self._newest_ns: tuple[int, int] | None = None  # answer of this connection: when it was sent, and came
 
@@ -182,8 +185,8 @@ class PoseExchange:
         Raises InvalidArgument where there is no memory to share any more: each connection has its own.
         """
         if self._memory is not None and self._is_open:
-            self._memory.close()
-            self._memory = SharedMemory()
+            self.close()
+            self._memory = self._new_memory()
         self._is_open, self._newest_ns = True, None
         mode = f"STREAM_MODE_{self.mode.name}"
         window = WINDOW if self.mode is StreamMode.LATEST else None
@@ -191,6 +194,21 @@ class PoseExchange:
         return rendering_pb2.RenderStreamRequest(
             settings=self._settings, mode=mode, window=window, shared_memory=memory
         )
+
+    def goes_without_memory(self, refusal: ClientError) -> bool:
+        """Whether a call ended only because the service cannot share memory, which nobody insists on."""
+        field = refusal.field or ""
+        return self._memory is not None and not self._needs_memory and field.startswith("shared_memory")
+
+    def give_up_memory(self) -> None:
+        """Frames come in messages from the next call on."""
+        self.close()
+        self._memory = None
+
+    @property
+    def may_give_up_memory(self) -> bool:
+        """Whether the service has not said yet that it shares memory, which nobody insists on."""
+        return self._memory is not None and not self._needs_memory and self._newest_ns is None
 
     @property
     def listener(self) -> socket.socket | None:
@@ -249,6 +267,15 @@ class PoseExchange:
         if frame.latency_ms is not None:
             self._latencies_ms.append(frame.latency_ms)
         return frame
+
+    def _new_memory(self) -> SharedMemory | None:
+        """Raises InvalidArgument where there is none that is insisted on."""
+        try:
+            return SharedMemory()
+        except InvalidArgument:
+            if self._needs_memory:
+                raise
+            return None
 
     def _predict_ms(self) -> float | None:
         """From the measurement of the next pose to when its frame will be seen; None: no pose is to be foretold."""

@@ -42,7 +42,7 @@ class LocalCall:
     def __next__(self) -> Any:
         """The next message. After the last one it raises what the call raises then."""
         self._is_settled.wait()
-        if self._socket is not None:
+        if self._socket is not None and not self._received.closed:
             with suppress(OSError):
                 if (length := self._received.read(_LENGTH.size)) and len(length) == _LENGTH.size:
                     size = _LENGTH.unpack(length)[0]
@@ -160,6 +160,8 @@ class AsyncLocalCall:
 
     def _hang_up(self, _: Any) -> None:
         """The call is over. What the service has sent can still be read."""
+        if not self._is_opened:
+            self._is_settled.set()
         if self._streams is not None:
             with suppress(OSError):
                 self._streams[1].get_extra_info("socket").shutdown(socket.SHUT_RD)

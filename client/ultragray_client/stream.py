@@ -65,6 +65,17 @@ class _PoseStream:
         self._lost += self._unanswered.take_lost()
         return opening
 
+    def _open_again(self, without_memory: bool) -> None:
+        if without_memory:
+            self._exchange.give_up_memory()
+        else:
+            self._is_resumed = True
+        self._open()
+
+    def _open(self) -> None:
+        """Starts a call for the poses that have no answer."""
+        raise NotImplementedError
+
     def _accepted(self, message: Any) -> Answer | None:
         """The answer that a message is; None: of a service that stops, and refused the pose."""
         if not self._unanswered.answered(message):
@@ -194,7 +205,6 @@ class FrameStream(_PoseStream):
             return None
 
     def _open(self) -> None:
-        """Starts a call for the poses that have no answer."""
         with self._changed:
             self._opening = self._begin_call()
             self._acknowledgement = None
@@ -230,7 +240,7 @@ class FrameStream(_PoseStream):
         failure = None
         if call.code() is not grpc.StatusCode.OK:
             failure = error_of_call(call, self._address)
-            if self._retries.may_help(failure):
+            if self._retries.may_help(failure) or self._exchange.goes_without_memory(failure):
                 return
         with self._changed:
             if call is self._call:
@@ -255,7 +265,8 @@ class FrameStream(_PoseStream):
     def _go_on(self, broken: Any, error: ClientError) -> bool:
         """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
         try:
-            pause_s = self._retries.pause_s(error)
+            gives_up_memory = self._exchange.goes_without_memory(error)
+            pause_s = 0.0 if gives_up_memory else self._retries.pause_s(error)
             with self._changed:
                 if self._closed and not self._unanswered:
                     return False
@@ -263,8 +274,7 @@ class FrameStream(_PoseStream):
                 if self._cancelled:
                     raise error
                 if self._call is broken:
-                    self._is_resumed = True
-                    self._open()
+                    self._open_again(gives_up_memory)
         except ClientError as final:
             with self._changed:
                 self._closed, self._failure = True, final
@@ -391,7 +401,7 @@ class AsyncFrameStream(_PoseStream):
             self._unsent.append(message)
             if await self._send_waiting():
                 return
-        if not self._retries.may_go_on:
+        if not (self._retries.may_go_on or self._exchange.may_give_up_memory):
             raise StreamEnded(TAKES_NO_MORE)
         self._waiting_to_go_on += 1
 
@@ -411,7 +421,6 @@ class AsyncFrameStream(_PoseStream):
         return None
 
     def _open(self) -> None:
-        """Starts a call for the poses that have no answer."""
         self._begin_call()
         call, listener = self._start(), self._exchange.listener
         call._cython_call = _CallThatKeepsItsStatus(call._cython_call)
@@ -450,13 +459,13 @@ class AsyncFrameStream(_PoseStream):
     async def _go_on(self, broken: Any, error: ClientError) -> bool:
         """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
         try:
-            pause_s = self._retries.pause_s(error)
+            gives_up_memory = self._exchange.goes_without_memory(error)
+            pause_s = 0.0 if gives_up_memory else self._retries.pause_s(error)
             if self._closed and not self._unanswered:
                 return False
             await asyncio.sleep(pause_s)
             if self._call is broken:
-                self._open()
-                self._is_resumed = True
+                self._open_again(gives_up_memory)
                 self._waiting_to_go_on = 0
                 self._resending = asyncio.ensure_future(self._resend())
         except ClientError as final:

@@ -27,7 +27,7 @@ SMALL = RenderSettings(height=16, width=16)
 
 def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client, proxy):
     shifts = np.linspace(-4, 4, 300)
-    with far_client.stream("demo", SMALL) as stream:
+    with far_client.stream("demo", SMALL, shared_memory=False) as stream:
         proxy.cut_after(3000, 10_000, 10_000)  # somewhere in a frame; the 300 have 76,800 pixels
 
         def send():
@@ -48,7 +48,7 @@ def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client, proxy):
 
 def test_a_latest_stream_goes_on_with_the_newest_pose(far_client, proxy):
     frames = []
-    with far_client.stream("demo", SMALL, mode="latest") as stream:
+    with far_client.stream("demo", SMALL, mode="latest", shared_memory=False) as stream:
         for number, x in enumerate(np.linspace(-4, 4, 300), start=1):
             stream.send(moved(x))
             if number % 3 == 0:
@@ -68,7 +68,7 @@ def test_a_latest_stream_goes_on_with_the_newest_pose(far_client, proxy):
 
 def test_errors_in_place_of_frames_come_once(far_client, proxy):
     told = []
-    with far_client.stream("demo", SMALL) as stream:
+    with far_client.stream("demo", SMALL, shared_memory=False) as stream:
         proxy.cut_after(6000)  # before the first pose: answers may come while others are sent
         for number in range(1, 41):
             stream.send(2 * np.eye(4) if number % 4 == 0 else moved(0.0))
@@ -90,7 +90,7 @@ def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client, proxy, 
         stream.send(moved(x))
         return stream.receive()
 
-    with far_client.stream("demo", SMALL) as ordinary:
+    with far_client.stream("demo", SMALL, shared_memory=False) as ordinary:
         expected = [frame_of(ordinary, x)["bmode"] for x in range(12)]
     with far_client.stream("demo", SMALL, mode=mode, shared_memory=True) as stream:
         frames = [frame_of(stream, x) for x in range(6)]

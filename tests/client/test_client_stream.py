@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray_client import RenderSettings, errors
+from ultragray_client import AsyncClient, RenderSettings, errors
 from ultragray_client import exchange as shared_memory
 from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
@@ -22,6 +22,7 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..service.conftest import ROOT
 from ..waiting import Deadline, wait_until
+from .conftest import KEY
 from .test_client_render import moved
 
 
@@ -185,7 +186,7 @@ def folder(monkeypatch):
 def test_frames_are_those_of_an_ordinary_stream(client, encoding, mode):
     settings = RenderSettings(outputs=("coverage", "bmode", "transmittance"), encoding=encoding)
     with (
-        client.stream("demo", settings) as ordinary,
+        client.stream("demo", settings, shared_memory=False) as ordinary,
         client.stream("demo", settings, mode=mode, shared_memory=True) as shared,
     ):
         for x in range(40):
@@ -206,7 +207,7 @@ def frame_at(stream, x_mm):
 
 
 def test_frames_that_are_held_are_not_overwritten(client):
-    with client.stream("demo", SMALL) as stream:
+    with client.stream("demo", SMALL, shared_memory=False) as stream:
         expected = [frame_at(stream, x)["bmode"] for x in range(SLOTS + 4)]
     with client.stream("demo", SMALL, shared_memory=True) as stream:
         held = []
@@ -250,6 +251,40 @@ def test_what_the_service_refuses_is_told(client, folder):
                 stream.receive()
             assert refused.value.field == "shared_memory.name"
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("reconnect_s", [None, 0.0])
+@pytest.mark.parametrize("mode", ["ordered", "latest"])
+def test_unless_it_is_insisted_on_frames_come_without_it_where_the_service_refuses_it(
+    client, folder, mode, reconnect_s
+):
+    for _ in range(10):
+        with client.stream("demo", SMALL, mode=mode, reconnect_s=reconnect_s) as stream:
+            frame = frame_at(stream, 1)
+            assert not is_shared(frame)
+            assert (frame.sequence, stream.reconnections, frame.dropped) == (1, 0, 0)
+            assert frame_at(stream, 2).sequence == 2
+    assert list(folder.iterdir()) == []
+
+
+async def test_likewise_for_asyncio(client_service, folder):
+    for reconnect_s in (None, 0.0):
+        async with (
+            AsyncClient(client_service.grpc, api_key=KEY) as client,
+            client.stream("demo", SMALL, reconnect_s=reconnect_s) as stream,
+        ):
+            for x in (1, 2):
+                await stream.send(moved(x))
+                frame = await stream.receive()
+                assert (is_shared(frame), frame.sequence, stream.reconnections) == (False, x, 0)
+
+
+def test_unless_it_is_turned_off_frames_of_this_host_come_through_it(client, client_service, monkeypatch, tmp_path):
+    with client.stream("demo", SMALL) as stream:
+        assert is_shared(frame_at(stream, 1))
+    monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path / "absent")
+    with client.stream("demo", SMALL) as stream:
+        assert not is_shared(frame_at(stream, 1))
 
 
 def test_a_system_without_such_memory_is_told(client, monkeypatch, tmp_path):
