@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -113,6 +114,7 @@ class KernelLines(NamedTuple):
     axes: FloatArray  # [3, 3]
 
     @classmethod
+    @lru_cache(maxsize=64)  # each frame asks for those of its probe
     def of(cls, probe: Probe) -> KernelLines:
         match probe.lines:
             case ParallelLines() as lines:

@@ -118,11 +118,9 @@ async def render(request: Request) -> Response:
     exact = plan.placed(sent)
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
-    async def rendered() -> RenderResult:
-        await service.limits.take_frames(len(exact), deadline)
-        return await service.rendering.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
-
-    result = await finish_or_abandon(rendered(), request.receive, deadline)
+    await service.limits.take_frames(len(exact), deadline)
+    with service.rendering.ask(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by) as asked:
+        result = await finish_or_abandon(asked.frames(), request.receive, deadline)
     data = await asyncio.to_thread(_dicom_of, result, body) if is_dicom else result.data
     return Response(data, 200, render_headers(result), choice.media_type)
 
