@@ -1,8 +1,10 @@
 """RenderPool against direct renders, in real worker processes."""
 
 import asyncio
+import gc
 import os
 import signal
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +96,44 @@ async def test_a_cancelled_request_leaves_the_queue(open_pool, random_poses, unt
         await pool.render(asking("a", random_poses(1)))
         assert "b" not in pool.loaded()
     assert rendered == ["a"]
+
+
+async def test_newer_poses_take_the_place_of_those_that_wait(open_pool, random_poses, expect_frames):
+    older, newer = random_poses(1, seed=1), random_poses(1, seed=2)
+    async with open_pool() as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        with pool.ask(asking("b", older)) as begun, pool.ask(asking("a", older)) as waits:
+            assert not begun.give_to(newer, None)
+            assert waits.give_to(newer, None)
+            assert pool.statistics().waiting_frames == 1
+            os.kill(worker, signal.SIGCONT)
+            for turn, poses in ((begun, older), (waits, newer)):
+                result = await pool.frames(turn)
+                np.testing.assert_array_equal(result.poses, poses)
+                expect_frames(turn.request, result)
+            assert not waits.give_to(older, None)
+
+
+@pytest.mark.parametrize("seconds", [60.0, 0.01], ids=["waiting", "failed"])
+async def test_a_turn_that_is_closed_is_not_rendered_and_its_failure_is_nobodys_loss(
+    open_pool, random_poses, until, seconds
+):
+    complaints = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: complaints.append(context))
+    async with open_pool() as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        with pool.ask(asking("a", random_poses(1))):
+            deadline = time.monotonic() + seconds
+            with pool.ask(asking("b", random_poses(1), deadline=deadline)):
+                await until(lambda: pool.statistics().waiting_frames == (seconds > 1.0))
+        assert pool.statistics().waiting_frames == 0
+        os.kill(worker, signal.SIGCONT)
+        await pool.render(asking("a", random_poses(1)))
+        assert pool.loaded().keys() == {"a"}
+    gc.collect()
+    assert complaints == []
 
 
 class OneRoom:
