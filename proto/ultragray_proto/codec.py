@@ -214,7 +214,8 @@ def _reader(descriptor: Descriptor, annotation: Any, known: frozenset[str] = fro
 
 @cache
 def _dataclass_reader(descriptor: Descriptor, cls: Any, known: frozenset[str]) -> Callable[..., Any]:
-    hints, oneofs, steps = get_type_hints(cls), _oneofs(descriptor), []
+    hints, oneofs = get_type_hints(cls), _oneofs(descriptor)
+    of_fields, of_oneofs = [], []
     for one in fields(cls):
         kind, is_optional = _optional_of(hints[one.name])
         has_default = one.default is not MISSING or one.default_factory is not MISSING
@@ -223,14 +224,33 @@ def _dataclass_reader(descriptor: Descriptor, cls: Any, known: frozenset[str]) -
         if not one.init or one.name in known:
             continue
         if (field := descriptor.fields_by_name.get(one.name)) is not None:
-            steps.append((one.name, _field_reader(field, kind, left_out, is_required)))
+            convert = _values_reader(field, kind)
+            of_fields.append((one.name, field.has_presence, is_required, left_out, convert))
         elif one.name in oneofs:
-            steps.append((one.name, _oneof_reader(one.name, oneofs[one.name], kind, left_out, is_required)))
+            members = partial(_read_member, one.name, oneofs[one.name], _members(kind) or {})
+            of_oneofs.append((one.name, is_required, left_out, members))
 
     def read(message: Any, **values: Any) -> Any:
-        for name, step in steps:
-            if (value := step(message)) is not _LEFT_OUT:
-                values[name] = value
+        for name, has_presence, is_required, left_out, convert in of_fields:  # all in one loop: frames have many
+            value = getattr(message, name)
+            if not (message.HasField(name) if has_presence else value):
+                if not is_required:
+                    if left_out is not _LEFT_OUT:
+                        values[name] = left_out
+                    continue
+                if has_presence:
+                    raise MessageInvalid("is required", field=name)
+            if convert is not None:
+                try:
+                    value = convert(value)
+                except MessageInvalid as error:
+                    raise error.under(name) from error.original
+            values[name] = value
+        for name, is_required, left_out, read_member in of_oneofs:
+            if is_required or message.WhichOneof(name) is not None:
+                values[name] = read_member(message)
+            elif left_out is not _LEFT_OUT:
+                values[name] = left_out
         try:
             return cls(**values)
         except ValueError as error:
@@ -239,46 +259,26 @@ def _dataclass_reader(descriptor: Descriptor, cls: Any, known: frozenset[str]) -
     return read
 
 
-def _oneof_reader(name: str, kinds: Mapping[str, Descriptor], kind: Any, left_out: Any, is_required: bool) -> _Convert:
-    read_member = partial(_read_member, name, kinds, _members(kind) or {})
-    if is_required:
-        return read_member
-    return lambda message: left_out if message.WhichOneof(name) is None else read_member(message)
-
-
-def _field_reader(field: FieldDescriptor, kind: Any, left_out: Any, is_required: bool) -> _Convert:
-    """Reads a field of a message as what an annotation without None says."""
-    name, convert = field.name, _values_reader(field, kind)
-
-    def read(message: Any) -> Any:
-        value = getattr(message, name)
-        if not (message.HasField(name) if field.has_presence else value):
-            if not is_required:
-                return left_out
-            if field.has_presence:
-                raise MessageInvalid("is required", field=name)
-        return _at(name, convert, value)
-
-    return read
-
-
-def _values_reader(field: FieldDescriptor, kind: Any) -> _Convert:
+def _values_reader(field: FieldDescriptor, kind: Any) -> _Convert | None:
+    """Makes of a field's value, or values, what an annotation without None says; None: they are that."""
     if _is_map(field):
         return dict
     if not field.is_repeated:
         return _value_reader(field, kind)
     container, convert = get_origin(kind) or kind, _value_reader(field, get_args(kind)[0])
+    if convert is None:
+        return container
     if field.message_type is None:
         return lambda values: container([convert(value) for value in values])
     return lambda values: container([_at(f"[{index}]", convert, value) for index, value in enumerate(values)])
 
 
-def _value_reader(field: FieldDescriptor, kind: Any) -> _Convert:
+def _value_reader(field: FieldDescriptor, kind: Any) -> _Convert | None:
     is_enum = isinstance(kind, type) and issubclass(kind, Enum)
     if field.message_type is not None:
         return _reader(field.message_type, kind)
     if field.enum_type is None:
-        return kind if is_enum else lambda value: value
+        return kind if is_enum else None
     enum, values = field.enum_type, {one.value: one for one in kind} if is_enum else None
     known = {
         number: word if values is None else values[word]
