@@ -215,10 +215,6 @@ class PoseExchange:
         """Where the service connects to for the messages of a connection that was opened; None: they go through it."""
         return None if self._memory is None else self._memory.listener
 
-    def acknowledgement(self, sequence: int) -> rendering_pb2.RenderStreamRequest:
-        """The message that the answer of that sequence was taken: a newer one may come."""
-        return rendering_pb2.RenderStreamRequest(acknowledged=sequence)
-
     def pose(
         self, pose: PoseLike, timeout_s: float | None, measured_ns: int | None
     ) -> rendering_pb2.RenderStreamRequest:
@@ -238,9 +234,17 @@ class PoseExchange:
         real = rendering_pb2.RealFrame(client_time_ns=measured_ns, **image_fields(image))
         return rendering_pb2.RenderStreamRequest(real=real)
 
-    def departing(self, message: rendering_pb2.RenderStreamRequest) -> rendering_pb2.RenderStreamRequest:
-        """The message, with what aligns the clocks of client and service as it goes."""
-        message.ClearField("clock")
+    def departing(
+        self, message: rendering_pb2.RenderStreamRequest | None, taken: int | None
+    ) -> rendering_pb2.RenderStreamRequest:
+        """A message as it goes: with what aligns the clocks of client and service, and with the sequence of the answer
+        that was `taken` since the one before, which makes room for a newer one. None: it tells nothing else.
+        """
+        message = message or rendering_pb2.RenderStreamRequest()
+        for name in ("clock", "acknowledged"):
+            message.ClearField(name)  # of one that goes again
+        if taken is not None:
+            message.acknowledged = taken
         if self._newest_ns is not None:
             sent_ns, arrived_ns = self._newest_ns
             stamps = {"answer_sent_ns": sent_ns, "answer_arrived_ns": arrived_ns, "sent_ns": time.monotonic_ns()}

@@ -51,6 +51,7 @@ class _PoseStream:
         self._failure: ClientError | None = None  # that ended the stream
         self._is_resumed = False  # the call that is open has brought nothing yet, and is not the first one
         self._reconnections = 0
+        self._taken: int | None = None  # the sequence of the answer to be acknowledged; it can wait for the next pose
         self._lost = 0  # poses since the last frame that get none: lost with a connection, or replaced here
 
     @property
@@ -60,7 +61,7 @@ class _PoseStream:
 
     def _begin_call(self) -> Any:
         """The opening of a call; with it all poses that have no answer wait to be sent."""
-        opening = self._exchange.opening()
+        opening, self._taken = self._exchange.opening(), None
         self._unsent = deque([opening, *self._unanswered.again()])
         self._lost += self._unanswered.take_lost()
         return opening
@@ -91,6 +92,10 @@ class _PoseStream:
             raise StreamEnded("the stream is over")
         return self._exchange.frame(answer, self._take_lost())
 
+    def _take_acknowledgement(self) -> int | None:
+        taken, self._taken = self._taken, None
+        return taken
+
     def _take_lost(self) -> int:
         lost, self._lost = self._lost, 0
         return lost + self._answers.take_skipped()
@@ -108,7 +113,6 @@ class FrameStream(_PoseStream):
         self._changed = threading.Condition()  # all below and in the base is read and written under it
         self._opening: Any = None
         self._cancelled = False
-        self._acknowledgement: Any = None  # to be sent
         self._real: Any = None  # the newest real frame, likewise
         self._over = False  # no more answers come
         self._open()
@@ -197,7 +201,7 @@ class FrameStream(_PoseStream):
                 self._changed.wait()
             if self._answers:
                 answer = self._answers.take()
-                self._acknowledgement = self._exchange.acknowledgement(answer.message.sequence)
+                self._taken = answer.message.sequence
                 self._changed.notify_all()
                 return answer
             if self._failure is not None:
@@ -207,7 +211,6 @@ class FrameStream(_PoseStream):
     def _open(self) -> None:
         with self._changed:
             self._opening = self._begin_call()
-            self._acknowledgement = None
             messages, listener = self._messages(self._unsent), self._exchange.listener
             call = self._start(messages) if listener is None else LocalCall(self._start, messages, listener)
             self._call = call
@@ -219,21 +222,23 @@ class FrameStream(_PoseStream):
         """What waits for a call, until another call takes its place, or no more poses come."""
         while True:
             with self._changed:
-                while unsent is self._unsent and not (unsent or self._acknowledgement or self._real or self._closed):
+                while unsent is self._unsent and not (
+                    unsent or self._real or self._closed or (self._taken and self._unanswered)
+                ):
                     self._changed.wait()
                 if unsent is not self._unsent:
                     return
                 is_opening = bool(unsent) and unsent[0] is self._opening
-                if self._acknowledgement and not is_opening:
-                    message, self._acknowledgement = self._acknowledgement, None
-                elif self._real and not is_opening:
+                message = None
+                if self._real and not is_opening:
                     message, self._real = self._real, None
                 elif unsent:
                     message = unsent.popleft()
                     self._changed.notify_all()
-                else:
+                taken = None if is_opening else self._take_acknowledgement()
+                if message is None and taken is None:
                     return
-            yield self._exchange.departing(message)
+            yield self._exchange.departing(message, taken)
 
     def _ended(self, call: Any) -> None:
         """Frees senders that wait for a call that is over, where none will follow; reading tells the reason, too."""
@@ -327,8 +332,7 @@ class AsyncFrameStream(_PoseStream):
         self._waiting_to_go_on = 0  # poses since the call broke
         self._may_send = asyncio.Event()
         self._come = asyncio.Event()  # an answer, or the end of them
-        self._taken = asyncio.Event()
-        self._taken_sequence = 0
+        self._may_acknowledge = asyncio.Event()
         self._tasks: tuple[asyncio.Task[None], ...] = ()  # of a latest stream, once it has begun
         self._resending: asyncio.Task[None] | None = None
         self._open()
@@ -413,8 +417,9 @@ class AsyncFrameStream(_PoseStream):
             answer = self._answers.take()
             if not self._answers and not self._tasks[0].done():
                 self._come.clear()
-            self._taken_sequence = answer.message.sequence
-            self._taken.set()
+            self._taken = answer.message.sequence
+            if self._unanswered:
+                self._may_acknowledge.set()
             return answer
         if self._failure is not None:
             raise self._failure
@@ -431,7 +436,7 @@ class AsyncFrameStream(_PoseStream):
         call = self._call
         try:
             while self._unsent:
-                await self._call.write(self._exchange.departing(self._unsent.popleft()))
+                await self._call.write(self._exchange.departing(self._unsent.popleft(), self._take_acknowledgement()))
             if self._closed:
                 await self._call.done_writing()
         except (asyncio.InvalidStateError, StreamEnded, grpc.RpcError):
@@ -493,8 +498,9 @@ class AsyncFrameStream(_PoseStream):
 
     async def _acknowledge(self) -> None:
         while True:
-            await self._taken.wait()
-            self._taken.clear()
+            await self._may_acknowledge.wait()
+            self._may_acknowledge.clear()
             async with self._sending:
-                self._unsent.append(self._exchange.acknowledgement(self._taken_sequence))
-                await self._send_waiting()
+                if self._taken is not None:  # else it went with a pose
+                    self._unsent.append(None)
+                    await self._send_waiting()

