@@ -136,7 +136,7 @@ class PoseStream:
         self._record = record or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
-        self._unanswered: set[_Underway] = set()
+        self._open: set[Asked[Resolved]] = set()  # frames that are still to be answered
         self._ended = False  # no more poses come
         self._dropped = 0
         # Of a latest stream: what is asked of the pool, and what comes after it.
@@ -174,8 +174,8 @@ class PoseStream:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
             self._answers = asyncio.Queue()
-            while self._unanswered:
-                _close(self._unanswered.pop())
+            while self._open:
+                self._open.pop().close()
             tasks.clear()
             del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
 
@@ -267,25 +267,26 @@ class PoseStream:
             return self._refused(unexpected(error))
         finally:
             frames.close()
-            self._unanswered.discard(underway)
+            self._open.discard(frames)
 
     def _asked(self, request: PoseRequest) -> Asked[Resolved] | UltragrayError:
         """The frame of a pose, which waits in the pool from now on; else why there will be none."""
         destination = self.destination if request.correct is None else None  # its pixels are made here
         try:
-            return self._rendering.ask(
+            asked = self._rendering.ask(
                 request.plan, request.pose[None], deadline=request.deadline, destination=destination
             )
         except UltragrayError as error:
             return self._refused(error)
         except Exception as error:
             return self._refused(unexpected(error))
+        self._open.add(asked)
+        return asked
 
     def _begin(
         self, request: PoseRequest, frames: Asked[Resolved] | UltragrayError, left: Callable[[], None]
     ) -> _Underway:
         underway = _Underway(request.sequence, request.client_time, frames, left, request)
-        self._unanswered.add(underway)
         self._answers.put_nowait(underway)
         return underway
 
@@ -337,11 +338,6 @@ class PoseStream:
     def _count_dropped(self) -> None:
         self._dropped += 1
         self._rendering.metrics.count_dropped()
-
-
-def _close(underway: _Underway) -> None:
-    if not isinstance(underway.frames, UltragrayError):
-        underway.frames.close()
 
 
 def unexpected(error: Exception) -> UltragrayError:
