@@ -152,7 +152,8 @@ def frames_at_a_glance(measured: Document) -> Lines:
     names = {
         ("kernel", 1): "renderer, 1 thread",
         ("kernel", 2): "renderer, 2 threads",
-        ("gRPC stream", 2): "to a client over a gRPC stream",
+        ("gRPC stream, shared memory", 2): "to a client of a gRPC stream, through shared memory",
+        ("gRPC stream", 2): "the same through the connection, as from other hosts",
         ("HTTP raw", 2): "to a client over HTTP, raw pixels",
         ("HTTP PNG", 2): "to a client over HTTP, PNG",
     }
