@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -71,7 +71,7 @@ class TrainingViews:
         return self._count
 
     def measure(self, poses: FloatArray, probe: Probe, points_per_side: int = POINTS_PER_SIDE) -> ViewMeasures:
-        """Measures poses [C, 4, 4] (mm) of a probe, which need not be the views' own. Raises InvalidPose."""
+        """Measures poses [C, 4, 4] (mm, exact) of a probe, which need not be the views' own."""
         distances, angles, around = self._measured(poses, probe, points_per_side)
         nearest_mm, before, behind = distances
         between = before * behind / np.maximum(before + behind, 1e-9)
@@ -86,7 +86,7 @@ class TrainingViews:
             weights / weights.sum(axis=1, keepdims=True),
         )
 
-    def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, P]
+    def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, 4, 4] mm, exact -> [C, P]
         """Root of the mean square distance of the points of each image to each view."""
         return self._measured(poses, probe, POINTS_PER_SIDE)[2]
 
@@ -111,29 +111,28 @@ class TrainingViews:
         """Of the points of each image: distances to the nearest view, to the nearest on either side, the angle to the
         nearest; and the root of the mean square distance to each view. In float32, by a kernel.
         """
-        points, checked = _image_points(probe, points_per_side), check_poses(poses)
-        distances = np.empty((len(checked), 3, len(points)), np.float32)
-        around = np.empty((len(checked), len(self._rotations)), np.float32)
-        angles = np.empty((len(checked), len(points)), np.float32)
-        nearest = np.empty(len(points), np.int64)
-        cosines = 0.5 * (checked[:, :3, :3].reshape(-1, 9) @ self._rotations.T - 1.0)  # [C, P']
-        turned = np.ascontiguousarray(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))), np.float32)
-        facing = np.ascontiguousarray(checked[:, :3, 1] @ self._elevations, np.float32)  # below 0: front and back swap
-        seen = points @ checked[:, :3, :3].transpose(0, 2, 1) + checked[:, None, :3, 3]  # [C, K, 3] mm
-        seen = np.ascontiguousarray(seen, np.float32)
-        for place in range(len(checked)):
+        points, rotations = _image_points(probe, points_per_side), poses[:, :3, :3]
+        distances = np.empty((3, len(poses), len(points)), np.float32)
+        around = np.empty((len(poses), len(self._rotations)), np.float32)
+        angles = np.empty((len(poses), len(points)))
+        measures, nearest = np.empty(3 * len(points), np.float32), np.empty(len(points), np.int64)
+        cosines = 0.5 * (rotations.reshape(-1, 9) @ self._rotations.T - 1.0)  # [C, P']
+        turned = np.degrees(np.arccos(np.minimum(np.maximum(cosines, -1.0), 1.0))).astype(np.float32)
+        facing = (rotations[:, :, 1] @ self._elevations).astype(np.float32)  # below 0: front and back swap
+        seen = (points @ rotations.transpose(0, 2, 1) + poses[:, None, :3, 3]).astype(np.float32)  # [C, K, 3] mm
+        for place in range(len(poses)):
             _cpu.measure_views(
                 points=seen[place],
                 **self._images,
                 angles=turned[place],
                 facing=facing[place],
-                measures=distances[place].reshape(-1),
+                measures=measures,
                 nearest=nearest,
                 around=around[place],
             )
+            distances[:, place] = measures.reshape(3, -1)
             angles[place] = turned[place, nearest]
-        doubles = distances.transpose(1, 0, 2).astype(np.float64)
-        return doubles, angles.astype(np.float64), around[:, : self._count].astype(np.float64)
+        return distances.astype(np.float64), angles, around[:, : self._count].astype(np.float64)
 
 
 @lru_cache(maxsize=64)
@@ -293,9 +292,13 @@ class ConfidenceModel:
 
     def predict(self, measures: ViewMeasures) -> FloatArray:  # [C]
         """The MS-SSIM expected at each pose, in [0, 1]."""
-        terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
-        expected = predicted(np.array(self.weights), terms, self.black_ms_ssim)
+        weights, hardness = self._arrays
+        expected = predicted(weights, terms_of(measures, hardness, self.fitted_to_mm), self.black_ms_ssim)
         return expected if self.support is None else self.limited(expected, self.support.expected_shares(measures))
+
+    @cached_property
+    def _arrays(self) -> tuple[FloatArray, FloatArray]:
+        return np.array(self.weights), np.array(self.hardness)
 
     def limited(self, confidences: FloatArray, supported_shares: FloatArray) -> FloatArray:  # [C] both
         """The confidences of poses, limited by the share of their pixels that has support."""
@@ -345,14 +348,13 @@ def terms_of(
     distance_mm = measures.distance_mm
     if fitted_to_mm is not None:
         distance_mm = distance_mm + np.maximum(distance_mm - fitted_to_mm, 0.0)
-    columns = (
-        np.full_like(distance_mm, -1.0),
-        np.log1p(measures.interpolation_mm / NEAR_MM),
-        distance_mm / DISTANCE_MM,
-        measures.angle_deg / ANGLE_DEG,
-        np.broadcast_to((measures.weights @ hardness)[:, None], distance_mm.shape),
-    )
-    return -np.stack(columns, axis=-1)
+    terms = np.empty((*distance_mm.shape, 1 + TERMS))
+    terms[..., 0] = 1.0
+    terms[..., 1] = -np.log1p(measures.interpolation_mm / NEAR_MM)
+    terms[..., 2] = distance_mm / -DISTANCE_MM
+    terms[..., 3] = measures.angle_deg / -ANGLE_DEG
+    terms[..., 4] = -(measures.weights @ hardness)[:, None]
+    return terms
 
 
 def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
@@ -368,7 +370,7 @@ def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] ->
 
 
 def logistic(values: FloatArray) -> FloatArray:
-    return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
+    return 1.0 / (1.0 + np.exp(np.minimum(-values, 500.0)))
 
 
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
