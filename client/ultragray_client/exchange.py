@@ -52,9 +52,9 @@ class SharedMemory:
         path = _FOLDER / f"ultragray-{secrets.token_hex(16)}"
         size = _HEADER_BYTES + SLOTS * SLOT_BYTES
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
             self.listener = socket.socket(socket.AF_UNIX)
             self._remove = weakref.finalize(self, _remove, path, self.listener)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
             try:
                 os.ftruncate(descriptor, size)
                 os.pwrite(descriptor, self._token + bytes([_FREE]) * SLOTS, 0)
@@ -64,7 +64,7 @@ class SharedMemory:
             self.listener.bind(f"{path}{_SOCKET}")
             os.chmod(f"{path}{_SOCKET}", 0o600)
             self.listener.listen(1)
-        except OSError as error:
+        except (OSError, AttributeError) as error:  # the latter where Python knows no such sockets
             raise InvalidArgument(
                 f"shared_memory cannot be had on this system: {error}", field="shared_memory"
             ) from None

@@ -245,12 +245,16 @@ class FrameStream(_PoseStream):
         failure = None
         if call.code() is not grpc.StatusCode.OK:
             failure = error_of_call(call, self._address)
-            if self._retries.may_help(failure) or self._exchange.goes_without_memory(failure):
+            if self._retries.may_help(failure):
                 return
         with self._changed:
-            if call is self._call:
-                self._closed, self._failure = True, failure
-                self._changed.notify_all()
+            if call is not self._call:
+                return
+            if failure is not None and self._exchange.goes_without_memory(failure) and not self._cancelled:
+                self._open_again(without_memory=True)  # at once: perhaps nobody reads before all poses are sent
+                return
+            self._closed, self._failure = True, failure
+            self._changed.notify_all()
 
     def _next(self) -> Answer | None:
         while True:
@@ -270,10 +274,12 @@ class FrameStream(_PoseStream):
     def _go_on(self, broken: Any, error: ClientError) -> bool:
         """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
         try:
-            gives_up_memory = self._exchange.goes_without_memory(error)
-            pause_s = 0.0 if gives_up_memory else self._retries.pause_s(error)
             with self._changed:
-                if self._closed and not self._unanswered:
+                if self._call is not broken:
+                    return True
+                gives_up_memory = self._exchange.goes_without_memory(error)
+                pause_s = 0.0 if gives_up_memory else self._retries.pause_s(error)
+                if self._closed and not self._unanswered and not gives_up_memory:
                     return False
                 self._changed.wait_for(lambda: self._cancelled, timeout=pause_s)
                 if self._cancelled:
@@ -403,11 +409,18 @@ class AsyncFrameStream(_PoseStream):
             self._begin()
             self._unanswered.sent(message)
             self._unsent.append(message)
+            call = self._call
             if await self._send_waiting():
                 return
-        if not (self._retries.may_go_on or self._exchange.may_give_up_memory):
+        refusal = await self._refusal_of_memory(call)
+        if call is not self._call:  # another has begun meanwhile, with all that has no answer
+            return
+        if refusal is not None:
+            await self._go_on(call, refusal)  # at once: perhaps nobody reads before all poses are sent
+        elif self._retries.may_go_on:
+            self._waiting_to_go_on += 1
+        else:
             raise StreamEnded(TAKES_NO_MORE)
-        self._waiting_to_go_on += 1
 
     async def _newest(self) -> Answer | None:
         """The newest answer that has come; None after the last one."""
@@ -463,10 +476,12 @@ class AsyncFrameStream(_PoseStream):
 
     async def _go_on(self, broken: Any, error: ClientError) -> bool:
         """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
+        if self._call is not broken:
+            return True
         try:
             gives_up_memory = self._exchange.goes_without_memory(error)
             pause_s = 0.0 if gives_up_memory else self._retries.pause_s(error)
-            if self._closed and not self._unanswered:
+            if self._closed and not self._unanswered and not gives_up_memory:
                 return False
             await asyncio.sleep(pause_s)
             if self._call is broken:
@@ -480,6 +495,14 @@ class AsyncFrameStream(_PoseStream):
             self._may_send.set()
             self._may_send.clear()
         return True
+
+    async def _refusal_of_memory(self, over: Any) -> ClientError | None:
+        """Why a call ended, where that was because of the memory, which nobody insists on."""
+        if not self._exchange.may_give_up_memory:
+            return None
+        end = await over.code(), await over.initial_metadata(), await over.trailing_metadata(), await over.details()
+        error = error_of_call(grpc.aio.AioRpcError(*end), self._address)
+        return error if self._exchange.goes_without_memory(error) else None
 
     def _begin(self) -> None:
         if self._is_latest and not self._tasks:

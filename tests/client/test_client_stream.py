@@ -1,6 +1,7 @@
 """Streams of poses, whose frames may come through memory that is shared with the service."""
 
 import ctypes
+import errno
 import gc
 import os
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 
 from ultragray_client import AsyncClient, RenderSettings, errors
 from ultragray_client import exchange as shared_memory
-from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
+from ultragray_client.exchange import MAX_WAITING, SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
@@ -280,6 +281,32 @@ async def test_likewise_for_asyncio(client_service, folder):
                 assert (is_shared(frame), frame.sequence, stream.reconnections) == (False, x, 0)
 
 
+@pytest.mark.parametrize("mode", ["ordered", "latest"])
+@pytest.mark.parametrize("reconnect_s", [None, 0.0])
+def test_nobody_need_read_for_poses_to_go_without_it(client, folder, mode, reconnect_s):
+    with client.stream("demo", SMALL, mode=mode, reconnect_s=reconnect_s) as stream:
+        for x in range(3 * MAX_WAITING):
+            stream.send(moved(x / 100))
+        stream.done_sending()
+        frames = list(stream)
+    assert len(frames) + sum(frame.dropped for frame in frames) == 3 * MAX_WAITING
+    assert frames[-1].sequence == 3 * MAX_WAITING
+    assert stream.reconnections == 0
+
+
+async def test_a_service_that_is_not_there_is_told_to_who_only_sends():
+    async with AsyncClient("127.0.0.1:1") as client, client.stream("demo", SMALL, reconnect_s=0.0) as stream:
+        with pytest.raises(errors.StreamEnded):
+            await stream.send(moved(0.0))
+
+
+def test_refused_settings_are_told_where_it_is_refused_too(client, folder):
+    with client.stream("missing", SMALL) as stream:
+        stream.done_sending()
+        with pytest.raises(errors.SceneNotFound):
+            stream.receive()
+
+
 def test_unless_it_is_turned_off_frames_of_this_host_come_through_it(client, client_service, monkeypatch, tmp_path):
     with client.stream("demo", SMALL) as stream:
         assert is_shared(frame_at(stream, 1))
@@ -304,6 +331,18 @@ def test_a_memory_that_is_not_used_leaves_no_file(folder):
     del memory
     gc.collect()
     assert list(folder.iterdir()) == []
+
+
+def test_a_memory_without_a_socket_leaves_nothing(folder, monkeypatch):
+    def none_left(family):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(shared_memory.socket, "socket", none_left)
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(errors.InvalidArgument, match="Too many open files"):
+        SharedMemory()
+    assert list(folder.iterdir()) == []
+    assert os.listdir("/proc/self/fd") == before
 
 
 def test_the_memory_of_a_stream_goes_with_its_last_frame(client, client_service):

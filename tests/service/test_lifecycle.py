@@ -18,6 +18,7 @@ from ..waiting import at_this_load, wait_until
 from ..warm import Hold
 from .conftest import ROOT, SOURCE_FOLDERS
 from .rpc.test_grpc_render import Conversation, error_info, moved
+from .test_clients_that_misbehave import LARGE, until_calm
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 SMALL = {"height": 48, "width": 48}
@@ -88,6 +89,20 @@ def test_a_second_signal_stops_at_once(start_service):
         for answer in pending:
             error = answer.exception()
             assert isinstance(error, httpx.TransportError) if error else answer.result().status_code == 503
+
+
+def test_a_client_that_has_stopped_reading_keeps_no_service_from_stopping(start_service):
+    service = start_service(drain_timeout_s=3600)
+    options = [("grpc.http2.bdp_probe", 0), ("grpc.max_receive_message_length", -1)]  # so that its window stays small
+    with grpc.insecure_channel(service.grpc, options=options) as channel:
+        conversation = Conversation(rendering_pb2_grpc.RenderServiceStub(channel))
+        conversation.send(settings=LARGE)
+        for sequence in range(100):
+            conversation.send(sequence, pose=moved(0))
+        until_calm(service)  # frames are ready, and nobody takes them
+        service.process.send_signal(signal.SIGTERM)
+        assert service.process.wait(300) == 0
+    assert service.log()[-1]["message"] == "stopped"
 
 
 def test_a_service_that_leaves_is_not_ready_and_answers_until_its_delay_or_a_second_signal_ends_that(start_service):

@@ -169,15 +169,18 @@ class PoseStream:
                 raise Draining("the service is stopping; the frames in flight have been answered")
         finally:
             self._rendering.metrics.count_stream(-1)
+            self._next = None  # else the end of the reader would have it asked for
             tasks = [reader, writer, stopping, *([] if self._waiting is None else [self._waiting])]
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
-            self._answers = asyncio.Queue()
-            while self._open:
-                self._open.pop().close()
-            tasks.clear()
-            del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
+            try:
+                await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
+            finally:  # also where this is cancelled once more
+                self._answers = asyncio.Queue()
+                while self._open:
+                    self._open.pop().close()
+                tasks.clear()
+                del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes
 
     async def ask(self, request: PoseRequest) -> None:
         """Takes a pose. An ordered stream waits while too many frames are in flight, or its key may have none yet."""

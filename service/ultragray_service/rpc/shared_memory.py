@@ -98,7 +98,10 @@ class SharedMemory:
 
 def _connected(asked: rendering_pb2.SharedMemory, path: str) -> socket.socket:
     """The service's end of the client's socket. Raises InvalidArgument."""
-    end = socket.socket(socket.AF_UNIX)
+    try:
+        end = socket.socket(socket.AF_UNIX)
+    except OSError as error:
+        raise _refused(asked, f"the service has no socket for it: {error.strerror}") from None
     try:
         end.setblocking(False)
         end.connect(path)

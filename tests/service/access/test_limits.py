@@ -116,6 +116,7 @@ LIMITS = {  # by the name of the key
     "frames": "frames_per_s=1",
     "poses": "frames_per_s=4",
     "batch": "frames_per_s=4",
+    "gone": "frames_per_s=1",
     "ordered": "frames_per_s=4",
     "latest": "frames_per_s=2",
     "streams": "streams=1",
@@ -189,6 +190,13 @@ def retry_after_s(error, reason):
         return None
     found[0].Unpack(delay)
     return float(delay.retry_delay.ToTimedelta().total_seconds())
+
+
+def test_a_request_whose_client_has_gone_waits_for_no_more_of_its_frames(limited):
+    body = {**SMALL, "poses": [POSE] * 250, "timeout_ms": 3_600_000}  # which take 250 s
+    with pytest.raises(httpx.ReadTimeout):
+        limited.http("gone", "POST", "/v1/scenes/demo/render", json=body, timeout=0.5)
+    wait_until(lambda: any(record.get("status") == 499 for record in limited.service.log()), within_s=60)
 
 
 DAY_S = 86_400

@@ -2,13 +2,15 @@
 
 import asyncio
 import gc
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_service.access.principals import Principal, Role, act_as
 from ultragray_service.core.open_streams import MAX_NAME, OpenStream, OpenStreams, StreamAnswer
-from ultragray_service.core.streams import FrameStream, PoseStream, StreamMode
+from ultragray_service.core.streams import FrameStream, PoseRequest, PoseStream, StreamMode
 from ultragray_service.errors import StreamNotFound
 from ultragray_service.settings import Settings
 from ultragray_service.wiring import make_service
@@ -68,6 +70,61 @@ def test_a_stream_that_is_refused_as_a_whole_is_not_ended_in_the_middle_of_an_an
 
     asyncio.run(main())
     assert len(written) == 1
+
+
+class Endless:
+    """A frame that never comes."""
+
+    is_closed = False
+
+    async def frames(self):
+        await asyncio.Event().wait()
+
+    def close(self):
+        self.is_closed = True
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("frames_per_s", [None, 1])
+def test_a_stream_that_is_cancelled_leaves_nothing_in_the_pool(service, monkeypatch, frames_per_s, times):
+    """Neither the frame under way nor the pose that waits for its client to acknowledge another."""
+    rendering, asked = service.rendering, []
+
+    def ask(*_, **__):
+        asked.append(Endless())
+        return asked[-1]
+
+    async def turn(deadline):
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr(rendering, "ask", ask)
+    monkeypatch.setattr(rendering, "limits", SimpleNamespace(mine=SimpleNamespace(frames_per_s=frames_per_s)))
+    rendering.limits.frame_turn = turn
+
+    async def main(window):
+        stream = PoseStream(rendering)
+        stream.mode = StreamMode.LATEST
+        stream.open_window(window)
+
+        async def read():
+            await stream.ask(PoseRequest(1, None, None, None, np.eye(4), None, 0.0))
+            await asyncio.Event().wait()
+
+        async def write(answer):
+            raise AssertionError("there is no frame")
+
+        running = asyncio.create_task(stream.run(read, write, write))
+        await asyncio.sleep(0.02)
+        for _ in range(times):
+            running.cancel()
+            await asyncio.sleep(0)
+        await asyncio.wait({running})
+        await asyncio.sleep(0.02)
+
+    for window in (0, 1):
+        asyncio.run(main(window))
+    assert len(asked) == 1
+    assert all(one.is_closed for one in asked)
 
 
 class Faulty:

@@ -1,5 +1,6 @@
 """Streams whose frames go through memory that the client shares, laid out as rendering.proto says."""
 
+import errno
 import os
 import secrets
 import socket
@@ -301,6 +302,17 @@ def test_no_file_is_looked_for_on_behalf_of_other_peers(memory, peer):
 def test_a_loopback_address_is_that_of_either_protocol(memory, peer):
     SharedMemory(memory.message, peer).close()
     assert not memory.path.exists()
+
+
+def test_a_service_without_another_socket_refuses_it(memory, monkeypatch):
+    def none_left(family):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    memory.message.has_socket = True
+    monkeypatch.setattr(socket, "socket", none_left)
+    with pytest.raises(InvalidArgument, match="Too many open files") as refused:
+        SharedMemory(memory.message, LOCAL_PEER)
+    assert refused.value.field == "shared_memory.name"
 
 
 def test_a_slot_that_cannot_be_written_is_not_lent(memory):

@@ -115,6 +115,15 @@ async def test_newer_poses_take_the_place_of_those_that_wait(open_pool, random_p
             assert not waits.give_to(older, None)
 
 
+async def test_frames_that_nobody_takes_keep_no_pool_from_closing(open_pool, random_poses, until, expect_frames):
+    async with open_pool() as pool:
+        turn = pool.ask(asking("a", random_poses(1)))
+        await until(lambda: not pool.statistics().busy)
+        await pool.drain(3600)
+    expect_frames(turn.request, await pool.frames(turn))
+    turn.close()
+
+
 @pytest.mark.parametrize("seconds", [60.0, 0.01], ids=["waiting", "failed"])
 async def test_a_turn_that_is_closed_is_not_rendered_and_its_failure_is_nobodys_loss(
     open_pool, random_poses, until, seconds

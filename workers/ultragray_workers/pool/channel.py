@@ -110,6 +110,7 @@ class MemoryPool:
 
     def __init__(self) -> None:
         self._spares: list[int] = []
+        self._is_closed = False
 
     def acquire(self) -> int:
         """The descriptor of a file that nobody else uses. It may hold an earlier reply."""
@@ -117,12 +118,13 @@ class MemoryPool:
 
     def release(self, descriptor: int) -> None:
         """Takes back a file that no worker writes any more."""
-        if len(self._spares) < MAX_SPARES and os.fstat(descriptor).st_size <= MAX_SPARE_BYTES:
+        if not self._is_closed and len(self._spares) < MAX_SPARES and os.fstat(descriptor).st_size <= MAX_SPARE_BYTES:
             self._spares.append(descriptor)
         else:
             os.close(descriptor)
 
     def close(self) -> None:
+        self._is_closed = True
         while self._spares:
             os.close(self._spares.pop())
 

@@ -70,7 +70,13 @@ class Turn:
         self.request = request  # with the newest poses
         self.ticket: Ticket | None = None  # None while the file of its scene is not on this host
         self.held: AbstractContextManager[Path] | None = None  # that file
+        self.is_awaited = False  # somebody waits for the answer
         self._pool = pool
+
+    @property
+    def is_rendered(self) -> bool:
+        """Whether there is an answer, which somebody may yet have to take."""
+        return self.ticket is not None and self.ticket.done.done()
 
     def give_to(self, poses: FloatArray, deadline: float | None) -> bool:  # [C, 4, 4] mm
         """Has other poses rendered in place of those that wait, as many of them; False where that is too late."""
@@ -170,7 +176,6 @@ class RenderPool:
         self._check_accepting()
         turn = Turn(self, request)
         self._turns.add(turn)
-        self._all_answered.clear()
         try:
             self._queue(turn)
         except BaseException:
@@ -186,35 +191,43 @@ class RenderPool:
 
     async def _answer(self, turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]) -> R:
         """What `read` makes of the answer to a request, while the memory of the answer is there."""
-        for _ in range(MAX_SCENE_CHANGES):
-            try:
-                if turn.ticket is None:  # fetches the file of the scene, or raises that there is none
-                    await asyncio.to_thread(self._store.path, turn.request.scene)
-                    raise SceneChangedError
-                rendered = await turn.ticket.done
-                self._renderer = rendered.renderer
-                return await read(turn.ticket, rendered)
-            except SceneChangedError:
-                if turn.request.version is not None:
-                    raise
-                self._leave(turn)
-                self._queue(turn)
+        turn.is_awaited = True
+        try:
+            for _ in range(MAX_SCENE_CHANGES):
+                try:
+                    if turn.ticket is None:  # fetches the file of the scene, or raises that there is none
+                        await asyncio.to_thread(self._store.path, turn.request.scene)
+                        raise SceneChangedError
+                    rendered = await turn.ticket.done
+                    self._renderer = rendered.renderer
+                    return await read(turn.ticket, rendered)
+                except SceneChangedError:
+                    if turn.request.version is not None:
+                        raise
+                    self._leave(turn)
+                    self._queue(turn)
+        finally:
+            turn.is_awaited = False
+            self._tell_if_answered()
         raise RenderFailed(f"scene {turn.request.scene!r} kept changing while it was being rendered", field="scene")
 
     def _queue(self, turn: Turn) -> None:
         """Makes a ticket for a turn, unless the file of its scene is not on this host now."""
+        if self._closed:
+            raise Draining("the service is stopping")
         if (held := self._store.hold(turn.request.scene)) is None:
             return
         turn.held = held
         turn.ticket = ticket = _ticket(turn.request, held.__enter__())
         self.deadlines.watch(ticket)
+        if self._draining:
+            ticket.done.add_done_callback(self._tell_if_answered)
         self._dispatcher.submit(ticket)
 
     def close_turn(self, turn: Turn) -> None:
         self._leave(turn)
         self._turns.discard(turn)
-        if not self._turns:
-            self._all_answered.set()
+        self._tell_if_answered()
 
     def _leave(self, turn: Turn) -> None:
         ticket, turn.ticket = turn.ticket, None
@@ -265,13 +278,21 @@ class RenderPool:
         )
 
     async def drain(self, timeout_s: float) -> None:
-        """Refuses new requests and returns when all earlier ones are answered, or after the timeout."""
+        """Refuses new requests and returns when all earlier ones are answered, or after the timeout.
+
+        An answer counts that nobody takes: the client of a stream may have stopped reading.
+        """
         self._draining = True
-        if self._turns:
+        for turn in self._turns:
+            if turn.ticket is not None:
+                turn.ticket.done.add_done_callback(self._tell_if_answered)
+        self._tell_if_answered()
+        if not self._all_answered.is_set():
             try:
                 await asyncio.wait_for(self._all_answered.wait(), timeout_s)
             except asyncio.TimeoutError:
-                logger.warning("%d requests were not answered within %g s of draining", len(self._turns), timeout_s)
+                count = sum(map(self._is_unanswered, self._turns))
+                logger.warning("%d requests were not answered within %g s of draining", count, timeout_s)
 
     async def close(self) -> None:
         """Ends all processes, and requests that are still open with Draining."""
@@ -284,9 +305,17 @@ class RenderPool:
         self._launcher.abandon_starting()
         await self._dispatcher.close()
         await self._launcher.close()
-        if self._turns:
-            await self._all_answered.wait()
+        self._all_answered.clear()
+        self._tell_if_answered()
+        await self._all_answered.wait()
         self.deadlines.close()
+
+    def _is_unanswered(self, turn: Turn) -> bool:
+        return turn.is_awaited or not (self._closed or turn.is_rendered)
+
+    def _tell_if_answered(self, _: object = None) -> None:
+        if self._draining and not any(map(self._is_unanswered, self._turns)):
+            self._all_answered.set()
 
     def _check_accepting(self) -> None:
         if self._draining:

@@ -118,7 +118,8 @@ async def render(request: Request) -> Response:
     exact = plan.placed(sent)
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
-    await service.limits.take_frames(len(exact), deadline)
+    counted = service.limits.take_frames(len(exact), deadline)
+    await (counted if len(exact) == 1 else finish_or_abandon(counted, request.receive, deadline))  # many take seconds
     with service.rendering.ask(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by) as asked:
         result = await finish_or_abandon(asked.frames(), request.receive, deadline)
     data = await asyncio.to_thread(_dicom_of, result, body) if is_dicom else result.data
