@@ -57,13 +57,17 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
 def _is_exact(rows: list[list[float]]) -> bool:  # of a pose [4, 4]
     """Whether a pose is exact already, as one is that comes by here again; numpy would take 50 µs to tell."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = rows
-    products = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
-    lengths = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)
     return (
         last == [0.0, 0.0, 0.0, 1.0]
-        and all(-MAX_POSITION_MM <= one <= MAX_POSITION_MM for one in (x, y, z))
-        and all(-EXACT <= one <= EXACT for one in products)
-        and all(-EXACT <= one - 1.0 <= EXACT for one in lengths)
+        and abs(x) <= MAX_POSITION_MM
+        and abs(y) <= MAX_POSITION_MM
+        and abs(z) <= MAX_POSITION_MM
+        and abs(a * b + d * e + g * h) <= EXACT
+        and abs(a * c + d * f + g * i) <= EXACT
+        and abs(b * c + e * f + h * i) <= EXACT
+        and abs(a * a + d * d + g * g - 1.0) <= EXACT
+        and abs(b * b + e * e + h * h - 1.0) <= EXACT
+        and abs(c * c + f * f + i * i - 1.0) <= EXACT
         and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
     )
 
