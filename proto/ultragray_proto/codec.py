@@ -265,8 +265,8 @@ def _values_reader(field: FieldDescriptor, kind: Any) -> _Convert | None:
         return dict
     if not field.is_repeated:
         return _value_reader(field, kind)
-    container, convert = get_origin(kind) or kind, _value_reader(field, get_args(kind)[0])
-    if convert is None:
+    container: _Convert = get_origin(kind) or kind
+    if (convert := _value_reader(field, get_args(kind)[0])) is None:
         return container
     if field.message_type is None:
         return lambda values: container([convert(value) for value in values])
