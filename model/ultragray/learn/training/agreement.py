@@ -367,7 +367,7 @@ class _Judge:
             before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
             span = times[frame + 1] - times[frame - 1]
             share = (times[frame] - times[frame - 1]) / span if span > 0.0 else 0.5
-            found.append(_psnr_db(blend_in_time(before, after, share), shown))
+            found.append(_psnr_db(blend_in_time(before, after, float(np.clip(share, 0.0, 1.0))), shown))
         return float(np.mean(found))
 
     def _points(self, frame: int) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm, [N]
