@@ -399,10 +399,12 @@ def _cuts(frames: _Frames, jumps: set[int]) -> Iterator[str]:
     if len(frames.numbers) < LEAST_PICTURES:
         return
     changes, past_one = (frames.changes(slice(-reach), slice(reach, None)) for reach in (1, 2))
-    usual = float(np.median(changes))
+    usual_mm = usual_step(frames.steps_mm)
+    is_moving = frames.steps_mm > REST * usual_mm
+    usual = float(np.median(changes[is_moving] if is_moving.any() else changes))
     for place in np.flatnonzero(changes > max(CUT_FACTOR * usual, SMALLEST_CUT)):
         is_single = place > 0 and past_one[place - 1] < changes[place] / 2
-        is_slow = frames.steps_mm[place] <= 2 * usual_step(frames.steps_mm)
+        is_slow = frames.steps_mm[place] <= 2 * usual_mm
         if place not in jumps and is_slow and not is_single:
             yield (
                 f"the picture changes at once from frame {frames.numbers[place]} to {frames.numbers[place + 1]}, "

@@ -196,6 +196,12 @@ def test_many_repeats_are_named_in_one_sentence(make_sweep):
     )
 
 
+def test_a_probe_that_rests_shows_how_little_a_picture_changes_not_how_much_another_may(make_sweep):
+    rests = np.clip(np.arange(45) - 40, 0, 4)
+    sweep = make_sweep(45, images=moving_texture(5)[rests], poses=make_sweep(5).poses[rests])
+    assert "at once" not in warnings_of(sweep)
+
+
 def test_black_pictures_do_not_change(make_sweep):
     """Whatever the noise in them; the picture changes where they begin and where they end."""
     images = moving_texture()
