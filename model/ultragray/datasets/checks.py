@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import cv2
 import numpy as np
@@ -92,7 +92,7 @@ LONGEST_USUAL_STEP_MM = 50.0
 MAX_TILT_FRAMES = 300
 THUMBNAIL = (32, 32)
 LEAST_PICTURES = 8  # of which changes and marks can be told
-MOST_REPEATS = 3  # of one kind that are told one by one
+MOST_REPEATS = 3  # of one kind that are told one by one: more in one sentence
 FLAT = 2.0  # levels, standard deviation of a thumbnail: below, it is black or noise, and its looks say little
 CUT_FACTOR, SMALLEST_CUT = 8.0, 0.15  # of one minus the correlation of two pictures
 STILL, BRIGHT = 6, 40  # levels: JPEG keeps text so
@@ -351,25 +351,22 @@ def _repeats(frames: _Frames) -> Iterator[str]:
     numbers = frames.numbers
     poses = np.round(frames.poses / SAME_POSE_MM).astype(np.int64)
     images = [_digest(image) for image in frames.images()]
-    same, stalled, frozen = [], [], []
-    for places in _groups([_digest(pose) for pose in poses]):
-        (same if len({images[place] for place in places}) == 1 else stalled).append(numbers[places])
-    for places in _groups(images):
-        if len({_digest(poses[place]) for place in places}) > 1:
-            frozen.append(numbers[places])
-    yield from _repeated(same, "are the same frame: one pose, one image")
-    yield from _repeated(stalled, "share one pose, but show different images: tracking stalled?")
-    yield from _repeated(frozen, "show one image at different poses: a frozen picture?")
-
-
-def _repeated(groups: Sequence[npt.NDArray[np.int64]], what: str) -> Iterator[str]:
-    """A sentence for each group of frames, by their numbers; one for all of them where they are many."""
-    if len(groups) <= MOST_REPEATS:
-        yield from (f"frames {frame_list(numbers)} {what}" for numbers in groups)
-        return
-    listed = frame_list(np.sort(np.concatenate(groups)))
-    sizes = sorted({len(numbers) for numbers in groups})
-    yield f"{len(groups)} times {' to '.join(map(str, sizes[:1] + sizes[1:][-1:]))} frames (of {listed}) {what}"
+    of_poses, of_images = _groups([_digest(pose) for pose in poses]), _groups(images)
+    same = [places for places in of_poses if len({images[place] for place in places}) == 1]
+    stalled = [places for places in of_poses if places not in same]
+    frozen = [places for places in of_images if len({_digest(poses[place]) for place in places}) > 1]
+    for groups, what in (
+        (same, "are the same frame: one pose, one image"),
+        (stalled, "share one pose, but show different images: tracking stalled?"),
+        (frozen, "show one image at different poses: a frozen picture?"),
+    ):
+        if len(groups) <= MOST_REPEATS:
+            yield from (f"frames {frame_list(numbers[places])} {what}" for places in groups)
+            continue
+        listed = frame_list(numbers[sorted(chain(*groups))])
+        fewest, most = (limit(map(len, groups)) for limit in (min, max))
+        size = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+        yield f"{len(groups)} times {size} frames (of {listed}) {what}"
 
 
 def _groups(digests: Sequence[bytes]) -> list[list[int]]:

@@ -194,9 +194,9 @@ REST = 0.2  # of a long step: shorter ones are those of a probe held still, or p
 
 
 def usual_step(steps: FloatArray) -> float:
-    """The median step of a path while the probe moves, however long it rests or its poses repeat; 0 where it never does.
+    """The median step of a path while the probe moves, whether or not it rests or its poses repeat; 0: it never moves.
 
-    Up to a quarter of the steps may be jumps.
+    Up to a quarter of the steps may be jumps, and three quarters those of a probe at rest.
     """
     moves = steps[steps > REST * np.quantile(steps, 0.75)] if len(steps) else steps
     return float(np.median(moves)) if len(moves) else 0.0

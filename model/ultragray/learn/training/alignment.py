@@ -69,12 +69,12 @@ def _factor_rows(count: int, ratios: FloatArray) -> Iterator[tuple[FloatArray, F
 # Estimates from the tracked path alone: where a new sweep begins, the tracker's noise, and the path without it.
 #
 # A hand or a robot moves a probe smoothly, while a tracker's errors differ from frame to frame. A pose has six
-# coordinates: the position of the probe's origin along the sweep's mean axes, and its turns about its own axes, added up
-# from frame to frame: a probe may turn as far as it likes. The second differences of each are the sum of two independent parts: those of the path, with variance q, and those
-# of the tracker's error, D·e with variance r of e. The two parts have different spectra, so q and r are found by
-# maximum likelihood; the path is then the posterior mean. A tracker's errors have the same size along all three axes,
-# but a probe that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken
-# for all.
+# coordinates: the position of the probe's origin along the sweep's mean axes, and its turns about its own axes, added
+# up from frame to frame: a probe may turn as far as it likes. The second differences of each are the sum of two
+# independent parts: those of the path, with variance q, and those of the tracker's error, D·e with variance r of e. The
+# two parts have different spectra, so q and r are found by maximum likelihood; the path is then the posterior mean. A
+# tracker's errors have the same size along all three axes, but a probe that moves unevenly along its path looks noisy
+# in that direction: the smallest r of the three is taken for all.
 
 JUMP = 6.0  # usual steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
