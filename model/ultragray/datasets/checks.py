@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_de
 from ultragray.datasets.images import CropBox
 from ultragray.geometry.probe import Fan, FloatArray, Probe
 from ultragray.geometry.rotations import rotation_angles_deg, turns_of
-from ultragray.learn.sweep import Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list
+from ultragray.learn.sweep import REST, Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list, usual_step
 from ultragray.learn.training.agreement import agreed_path
 
 VOXEL_MM = 1.0
@@ -92,6 +92,8 @@ LONGEST_USUAL_STEP_MM = 50.0
 MAX_TILT_FRAMES = 300
 THUMBNAIL = (32, 32)
 LEAST_PICTURES = 8  # of which changes and marks can be told
+MOST_REPEATS = 3  # of one kind that are told one by one: more in one sentence
+FLAT = 2.0  # levels, standard deviation of a thumbnail: below, it is black or noise, and its looks say little
 CUT_FACTOR, SMALLEST_CUT = 8.0, 0.15  # of one minus the correlation of two pictures
 STILL, BRIGHT = 6, 40  # levels: JPEG keeps text so
 LEAST_MARKS, LEAST_ALIVE, MAX_BOXES = 12, 0.2, 3
@@ -206,12 +208,19 @@ class _Frames:
         return found
 
     @cached_property
-    def thumbnails(self) -> npt.NDArray[np.float32]:  # [F, P] without mean, of length 1
+    def thumbnails(self) -> npt.NDArray[np.float32]:  # [F, P] without mean, of length 1, or less where they are FLAT
         small = [cv2.resize(one, THUMBNAIL, interpolation=cv2.INTER_AREA).ravel() for one in self.images()]
         looks = np.array(small, np.float32)
         looks -= looks.mean(axis=1, keepdims=True)
-        looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+        looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), FLAT * math.sqrt(looks.shape[1]))
         return looks
+
+    def changes(self, first: slice, second: slice) -> npt.NDArray[np.float32]:
+        """One minus the correlation of pictures in pairs; of two flat ones, little."""
+        ones, others = self.thumbnails[first], self.thumbnails[second]
+        products, *squares = (np.einsum("fp,fp->f", *pair) for pair in ((ones, others), (ones, ones), (others, others)))
+        found: npt.NDArray[np.float32] = sum(squares) / 2.0 - products
+        return found
 
     def delay(self) -> DelayEstimate | None:
         """How late the images are, where the frames have times and the motion tells it."""
@@ -261,12 +270,13 @@ def _warnings(frames: _Frames) -> Iterator[str]:
         yield from clock_warnings(frames.times_s, frames.numbers)
     yield from _moved_far(frames)
     yield from _to_and_fro(frames)
-    jumps = list(_jumps(frames))
+    jumps = sorted(_jumps(frames))
+    steps = {step for some, _ in jumps for step in some}
     yield from (text for _, text in jumps)
-    yield from _turned(frames, {place for place, _ in jumps})
+    yield from _turned(frames, steps)
     yield from _repeats(frames)
     yield from _odd_images(frames)
-    yield from _cuts(frames, {place for place, _ in jumps})
+    yield from _cuts(frames, steps)
     yield from _overlays(frames)
 
 
@@ -304,47 +314,59 @@ def _turned(frames: _Frames, jumps: set[int]) -> Iterator[str]:
             )
 
 
-def _jumps(frames: _Frames) -> Iterator[tuple[int, str]]:
-    """Steps far longer than usual: a frame off its two neighbours, or a gap such as between two sweeps."""
-    numbers, steps_mm = frames.numbers, frames.steps_mm
+def _jumps(frames: _Frames) -> Iterator[tuple[list[int], str]]:
+    """Steps far longer than usual, by the frames before them: of a frame off its two neighbours, of a gap such as
+    between two sweeps, or of a probe that goes far for a while."""
+    numbers, steps_mm, corners = frames.numbers, frames.steps_mm, frames.corners
     speeds = steps_mm / np.abs(np.diff(numbers)).clip(min=1)
     if len(speeds) < 3:
         return
-    usual = float(np.median(speeds))
-    spread = 1.4826 * float(np.median(np.abs(speeds - usual)))
+    if not (usual := usual_step(speeds)):
+        return
+    spread = 1.4826 * float(np.median(np.abs(speeds[speeds > REST * usual] - usual)))
     limit = max(JUMP_FACTOR * usual, usual + JUMP_SPREADS * spread, SMALLEST_JUMP_MM)
-    jumps = [int(place) for place in np.flatnonzero(speeds > limit)]
-    skip = -1
-    for place in jumps:
-        if place == skip:
-            continue
-        if place + 1 in jumps:
+    jumps = np.flatnonzero(speeds > limit).tolist()
+    for before, after in pairwise(list(jumps)):
+        is_pair = after == before + 1 and before in jumps  # no part of the pair before
+        if is_pair and corner_distances_mm(corners[before], corners[after + 1]) < steps_mm[[before, after]].max():
             yield (
-                place,
-                f"frame {numbers[place + 1]} lies {steps_mm[place]:.1f} mm off the frame before and "
-                f"{steps_mm[place + 1]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?",
+                [before, after],
+                f"frame {numbers[after]} lies {steps_mm[before]:.1f} mm off the frame before and "
+                f"{steps_mm[after]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?",
             )
-            skip = place + 1
-        else:
-            yield (
-                place,
-                f"a jump of {steps_mm[place]:.1f} mm from frame {numbers[place]} to {numbers[place + 1]}, where "
-                f"{usual:.2g} mm are usual: another sweep, or lost tracking?",
-            )
+            jumps = [place for place in jumps if place not in (before, after)]
+    for run in np.split(np.array(jumps, np.int64), np.flatnonzero(np.diff(jumps) > 1) + 1) if jumps else ():
+        first, last, longest_mm = numbers[run[0]], numbers[run[-1] + 1], steps_mm[run].max()
+        yield (
+            run.tolist(),
+            f"a jump of {longest_mm:.1f} mm from frame {first} to {last}, where {usual:.2g} mm are usual: another "
+            "sweep, or lost tracking?"
+            if len(run) == 1
+            else f"steps of up to {longest_mm:.1f} mm from frame {first} to {last}, where {usual:.2g} mm are usual: a "
+            "probe lifted off or turned, or lost tracking?",
+        )
 
 
 def _repeats(frames: _Frames) -> Iterator[str]:
     numbers = frames.numbers
     poses = np.round(frames.poses / SAME_POSE_MM).astype(np.int64)
     images = [_digest(image) for image in frames.images()]
-    for places in _groups([_digest(pose) for pose in poses]):
-        if len({images[place] for place in places}) == 1:
-            yield f"frames {frame_list(numbers[places])} are the same frame: one pose, one image"
-        else:
-            yield f"frames {frame_list(numbers[places])} share one pose, but show different images: tracking stalled?"
-    for places in _groups(images):
-        if len({_digest(poses[place]) for place in places}) > 1:
-            yield f"frames {frame_list(numbers[places])} show one image at different poses: a frozen picture?"
+    of_poses, of_images = _groups([_digest(pose) for pose in poses]), _groups(images)
+    same = [places for places in of_poses if len({images[place] for place in places}) == 1]
+    stalled = [places for places in of_poses if places not in same]
+    frozen = [places for places in of_images if len({_digest(poses[place]) for place in places}) > 1]
+    for groups, what in (
+        (same, "are the same frame: one pose, one image"),
+        (stalled, "share one pose, but show different images: tracking stalled?"),
+        (frozen, "show one image at different poses: a frozen picture?"),
+    ):
+        if len(groups) <= MOST_REPEATS:
+            yield from (f"frames {frame_list(numbers[places])} {what}" for places in groups)
+            continue
+        listed = frame_list(numbers[sorted(chain(*groups))])
+        fewest, most = (limit(map(len, groups)) for limit in (min, max))
+        size = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+        yield f"{len(groups)} times {size} frames (of {listed}) {what}"
 
 
 def _groups(digests: Sequence[bytes]) -> list[list[int]]:
@@ -371,14 +393,15 @@ def _odd_images(frames: _Frames) -> Iterator[str]:
 
 def _cuts(frames: _Frames, jumps: set[int]) -> Iterator[str]:
     """Pictures that change at once where the probe hardly moves: another depth, gain or mode."""
-    looks = frames.thumbnails
-    if len(looks) < LEAST_PICTURES:
+    if len(frames.numbers) < LEAST_PICTURES:
         return
-    changes = 1.0 - (looks[:-1] * looks[1:]).sum(axis=1)
-    usual = float(np.median(changes))
+    changes, past_one = (frames.changes(slice(-reach), slice(reach, None)) for reach in (1, 2))
+    usual_mm = usual_step(frames.steps_mm)
+    is_moving = frames.steps_mm > REST * usual_mm
+    usual = float(np.median(changes[is_moving] if is_moving.any() else changes))
     for place in np.flatnonzero(changes > max(CUT_FACTOR * usual, SMALLEST_CUT)):
-        is_single = place > 0 and 1.0 - float(looks[place - 1] @ looks[place + 1]) < changes[place] / 2
-        is_slow = frames.steps_mm[place] <= 2 * np.median(frames.steps_mm)
+        is_single = place > 0 and past_one[place - 1] < changes[place] / 2
+        is_slow = frames.steps_mm[place] <= 2 * usual_mm
         if place not in jumps and is_slow and not is_single:
             yield (
                 f"the picture changes at once from frame {frames.numbers[place]} to {frames.numbers[place + 1]}, "

@@ -190,6 +190,18 @@ def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray: 
     return means
 
 
+REST = 0.2  # of a long step: shorter ones are those of a probe held still, or poses that a tracker repeats
+
+
+def usual_step(steps: FloatArray) -> float:
+    """The median step of a path while the probe moves, whether or not it rests or its poses repeat; 0: it never moves.
+
+    Up to a quarter of the steps may be jumps, and three quarters those of a probe at rest.
+    """
+    moves = steps[steps > REST * np.quantile(steps, 0.75)] if len(steps) else steps
+    return float(np.median(moves)) if len(moves) else 0.0
+
+
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
     origins, directions = probe.scan_lines(width)
     positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
@@ -215,7 +227,7 @@ def _along_path(sweep: Sweep, others: Sweep) -> FloatArray | None:  # [V]
     """
     starts, ends = sweep.corners_mm()[:-1], sweep.corners_mm()[1:]  # [F − 1, K, 3]
     steps, lengths = ends - starts, corner_distances_mm(ends, starts)
-    usual_mm = float(np.median(lengths))
+    usual_mm = usual_step(lengths)
     if not len(others) or usual_mm == 0.0:
         return None
     squares = np.square(steps).sum(axis=(1, 2))

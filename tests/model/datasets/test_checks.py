@@ -164,6 +164,55 @@ def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep):
     assert warnings_of(gap).startswith("a jump of 16.0 mm from frame 9 to 10, where 1 mm are usual")
 
 
+def test_steps_are_compared_with_those_of_a_probe_that_moves(make_sweep):
+    """Not with those of one that rests, or of a tracker that gives each pose three times."""
+    poses = make_sweep(120, step_mm=2.0).poses
+    for rests in (np.arange(120) // 3 * 3, np.clip(np.arange(120) - 60, 0, 59), np.clip(np.arange(120), 0, 20)):
+        report = check_sweep(make_sweep(120, poses=poses[rests]))
+        assert not [text for text in report.warnings if "jump" in text]
+    (told,) = (text for text in report.warnings if "share one pose" in text)
+    assert told.startswith("frames 20 to 119 share one pose")
+
+
+def test_a_probe_that_is_lifted_off_is_named_once(make_sweep):
+    poses = make_sweep(40).poses.copy()
+    poses[30:, 2, 3] -= 8.0 * np.arange(1, 11)
+    told = warnings_of(make_sweep(40, poses=poses))
+    assert told.startswith("steps of up to 8.1 mm from frame 29 to 39, where 1 mm are usual: a probe lifted off")
+    assert "\n" not in told
+
+
+def test_single_poses_off_their_neighbours_are_named_one_by_one(make_sweep):
+    poses = make_sweep(40).poses.copy()
+    poses[[10, 12, 20], 0, 3] += 20.0
+    told = warnings_of(make_sweep(40, poses=poses)).splitlines()
+    assert [text.split(" lies")[0] for text in told] == ["frame 10", "frame 12", "frame 20"]
+
+
+def test_many_repeats_are_named_in_one_sentence(make_sweep):
+    poses = make_sweep(21, step_mm=2.0).poses[np.arange(21) // 3 * 3]
+    assert warnings_of(make_sweep(21, poses=poses)) == (
+        "7 times 3 frames (of 0 to 20) share one pose, but show different images: tracking stalled?"
+    )
+
+
+def test_a_probe_that_rests_shows_how_little_a_picture_changes_not_how_much_another_may(make_sweep):
+    rests = np.clip(np.arange(45) - 40, 0, 4)
+    sweep = make_sweep(45, images=moving_texture(5)[rests], poses=make_sweep(5).poses[rests])
+    assert "at once" not in warnings_of(sweep)
+
+
+def test_black_pictures_do_not_change(make_sweep):
+    """Whatever the noise in them; the picture changes where they begin and where they end."""
+    images = moving_texture()
+    noise = np.random.default_rng(0).integers(0, 2, images[5:12].shape, dtype=np.uint8)
+    images[5:12] = noise
+    told = [text for text in warnings_of(make_sweep(20, images=images)).splitlines() if "at once" in text]
+    assert len(told) == 2
+    assert "from frame 4 to 5" in told[0]
+    assert "from frame 11 to 12" in told[1]
+
+
 def test_repeats_are_named(make_sweep):
     sweep = make_sweep(8)
     stalled = sweep.poses.copy()

@@ -56,6 +56,8 @@ GAIN_OF_EVENNESS_DB = 0.03  # where poses are exact, it loses
 LOSS_OF_CROSSING_DB = 0.1  # within the passes, for their agreement
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
+FEW = 1 / 3  # of the frames, those that gain most by shares
+LOSS_OF_OTHERS_DB = 0.2  # by shares, on the mean of the other frames
 FAR = 4  # frames away from the one that is predicted
 LEAST_PREDICTED = 8  # frames: fewer may fit any shares, and an even path, by chance
 CROSSING_FRAMES, CROSSING_PIXELS = 48, 512  # that are looked at in other passes, of each
@@ -188,12 +190,17 @@ def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], pla
 
     Frames are predicted from their neighbours and from those FAR away. A slow hand hardly moves within the plane from
     one frame to the next: then far ones tell. They show less of the same anatomy, and alone they would err.
+
+    A probe that is lifted off shows the same air wherever it goes, as if that followed it: such frames gain more than
+    all others lose.
     """
+
+    def path(shares: Shares) -> FloatArray:
+        return with_shares(poses, ranges, judge.sweep.probe, shares)[places]
 
     @cache
     def psnr_db(shares: Shares) -> float:
-        path = with_shares(poses, ranges, judge.sweep.probe, shares)[places]
-        return (judge.psnr_db(path) + judge.psnr_db(path, FAR)) / 2.0
+        return (judge.psnr_db(path(shares)) + judge.psnr_db(path(shares), FAR)) / 2.0
 
     if len(judge.frames) < LEAST_PREDICTED:
         return RIGID
@@ -206,9 +213,11 @@ def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], pla
                 best, other = other, _stepped(other, number, step)
     if psnr_db(best) < psnr_db(RIGID) + GAIN_OF_SHARES_DB:
         return RIGID
-    still, moved = (
-        judge.crossing_db(with_shares(poses, ranges, judge.sweep.probe, one)[places]) for one in (RIGID, best)
-    )
+    pairs = ([judge.frames_db(path(one), reach) for one in (best, RIGID)] for reach in (1, FAR))
+    gains = np.concatenate([moved - still for moved, still in pairs])
+    if np.sort(gains)[: round((1.0 - FEW) * len(gains))].mean() < -LOSS_OF_OTHERS_DB:
+        return RIGID
+    still, moved = (judge.crossing_db(path(one)) for one in (RIGID, best))
     return RIGID if still is not None and (moved is None or moved < still - LEAST_GAIN_DB) else best
 
 
@@ -316,6 +325,10 @@ class _Judge:
         return cls(sweep, frames, far, passes)
 
     def psnr_db(self, poses: FloatArray, reach: int = 1) -> float:  # [F, 4, 4] mm
+        """The mean of `frames_db`."""
+        return float(self.frames_db(poses, reach).mean())
+
+    def frames_db(self, poses: FloatArray, reach: int = 1) -> FloatArray:  # [F, 4, 4] mm -> [P or Q]
         """Of the pixels as predicted in space by these poses, from the frames `reach` (1, or FAR where there are such)
         before and behind.
 
@@ -325,7 +338,7 @@ class _Judge:
         """
         frames, reach = (self.frames, 1) if reach == 1 or not len(self.far) else (self.far, reach)
         inverses = np.asarray(np.linalg.inv(poses), np.float64)
-        return float(np.mean([self._predicted_db(poses, inverses, frame, reach) for frame in frames]))
+        return np.array([self._predicted_db(poses, inverses, frame, reach) for frame in frames])
 
     def _predicted_db(self, poses: FloatArray, inverses: FloatArray, frame: int, reach: int) -> float:
         local, shown = self._points(frame)
@@ -367,7 +380,7 @@ class _Judge:
             before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
             span = times[frame + 1] - times[frame - 1]
             share = (times[frame] - times[frame - 1]) / span if span > 0.0 else 0.5
-            found.append(_psnr_db(blend_in_time(before, after, share), shown))
+            found.append(_psnr_db(blend_in_time(before, after, float(np.clip(share, 0.0, 1.0))), shown))
         return float(np.mean(found))
 
     def _points(self, frame: int) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm, [N]

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import mean_axes, rotations_of, transforms_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places, usual_step
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -69,14 +69,14 @@ def _factor_rows(count: int, ratios: FloatArray) -> Iterator[tuple[FloatArray, F
 # Estimates from the tracked path alone: where a new sweep begins, the tracker's noise, and the path without it.
 #
 # A hand or a robot moves a probe smoothly, while a tracker's errors differ from frame to frame. A pose has six
-# coordinates: the position of the probe's origin along the sweep's mean axes, and the turn from its mean orientation.
-# The second differences of each are the sum of two independent parts: those of the path, with variance q, and those
-# of the tracker's error, D·e with variance r of e. The two parts have different spectra, so q and r are found by
-# maximum likelihood; the path is then the posterior mean. A tracker's errors have the same size along all three axes,
-# but a probe that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken
-# for all.
+# coordinates: the position of the probe's origin along the sweep's mean axes, and its turns about its own axes, added
+# up from frame to frame: a probe may turn as far as it likes. The second differences of each are the sum of two
+# independent parts: those of the path, with variance q, and those of the tracker's error, D·e with variance r of e. The
+# two parts have different spectra, so q and r are found by maximum likelihood; the path is then the posterior mean. A
+# tracker's errors have the same size along all three axes, but a probe that moves unevenly along its path looks noisy
+# in that direction: the smallest r of the three is taken for all.
 
-JUMP = 6.0  # median steps: a longer step begins a new sweep
+JUMP = 6.0  # usual steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
 RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
 TINY = 1e-300  # a variance whose logarithm is finite
@@ -102,8 +102,7 @@ def path_ranges(corners: FloatArray) -> list[range]:  # [F, K, 3] mm
     """The same of a path, by the corners of its images."""
     steps = corner_distances_mm(corners[1:], corners[:-1])
     starts = [0]
-    moves = steps[steps > 0.0]  # a tracker may repeat its last pose
-    for place in np.flatnonzero(steps > JUMP * np.median(moves)) + 1 if len(moves) else ():
+    for place in np.flatnonzero(steps > JUMP * usual_step(steps)) + 1:
         if place - starts[-1] >= LEAST_FRAMES and len(corners) - place >= LEAST_FRAMES:
             starts.append(int(place))
     return [range(first, last) for first, last in pairwise([*starts, len(corners)])]
@@ -130,18 +129,18 @@ def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # 
             cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
     found = poses.copy()
     for frames in ranges:
-        axes = mean_axes(poses[frames])
-        found[frames, :3, 3] = cleaned[frames, :3] @ axes.T
-        found[frames, :3, :3] = axes @ rotations_of(np.radians(cleaned[frames, 3:]))
+        found[frames, :3, 3] = cleaned[frames, :3] @ mean_axes(poses[frames]).T
+    found[:, :3, :3] @= rotations_of(np.radians(cleaned[:, 3:] - coordinates[:, 3:]))
     return found
 
 
 def _coordinates(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 6] mm, degrees
     found = np.zeros((len(poses), _NUMBERS))
     for frames in ranges:
-        axes = mean_axes(poses[frames])
-        found[frames, :3] = poses[frames, :3, 3] @ axes
-        found[frames, 3:] = np.degrees(turns_of(axes.T @ poses[frames, :3, :3]))
+        own = poses[frames]
+        turns = turns_of(own[:-1, :3, :3].transpose(0, 2, 1) @ own[1:, :3, :3])
+        found[frames, :3] = own[:, :3, 3] @ mean_axes(own)
+        found[frames[1:], 3:] = np.degrees(turns.cumsum(axis=0))
     return found
 
 

@@ -68,15 +68,15 @@ def crossing_agreement(
 ) -> Agreement | None:
     """The motions of all frames of a path with which its passes agree; of a held-out one, that of the frames about it.
 
-    None where there is one pass, where passes have little in common, and where they do not agree better by
-    LEAST_GAIN.
+    None where the training frames are of one pass, where passes have little in common, and where they do not agree
+    better by LEAST_GAIN.
     """
-    if len(ranges) < 2:
-        return None
     some = spread_places(len(sweep), FRAMES)
     chosen = places[some]
-    looked_at = replace(sweep.select(some), poses=path[chosen])
     passes = np.repeat(np.arange(len(ranges)), [len(frames) for frames in ranges])[chosen]
+    if len(np.unique(passes)) < 2:
+        return None
+    looked_at = replace(sweep.select(some), poses=path[chosen])
     fitted, judged = (_Crossing(looked_at, passes, seed) for seed in range(2))
     all_splines = _splines(ranges, max(KNOT_FRAMES * len(path) / len(sweep), len(path) / MOST_KNOTS))
     splines = all_splines[chosen]

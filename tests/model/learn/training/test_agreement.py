@@ -9,7 +9,7 @@ import pytest
 from ultragray.datasets.checks import check_dataset
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.scoring import evaluate
-from ultragray.learn.sweep import Dataset, corner_distances_mm
+from ultragray.learn.sweep import Dataset, Sweep, corner_distances_mm
 from ultragray.learn.training import agreement, train
 from ultragray.learn.training.agreement import RIGID, agreed_path, with_shares
 from ultragray.learn.training.poses import held_out_on_path
@@ -191,6 +191,21 @@ def test_exact_poses_of_rigid_tissue_stay():
     given, path = known("exact")
     assert path.of(given) is given
     assert path.shares == RIGID
+
+
+def test_a_probe_that_is_lifted_off_does_not_tell_that_tissue_follows():
+    """Air looks the same wherever the probe goes, as if it followed it."""
+    away = hand_path()[-1] @ poses_of(np.zeros((30, 3)), np.arange(1, 31)[:, None] * [[2.0, 0.5, -5.0]])
+    tissue = seen(hand_path())
+    noise = np.random.default_rng(0).integers(0, 3, (30, *tissue.images.shape[1:]), dtype=np.uint8)
+    air = (200.0 * np.exp(-np.arange(tissue.height) / 3.0)).astype(np.uint8)[:, None] + noise
+    whole = Sweep(
+        np.concatenate([tissue.images, air]), np.concatenate([tissue.poses, away]), PROBE, np.arange(90), "lifted off"
+    )
+    given = Dataset("hand", whole.select(np.arange(0, 90, 2)), whole.select(np.arange(1, 90, 2)))
+    path = agreed_path(given)
+    assert path.shares == RIGID
+    assert path.train is given.train.poses
 
 
 def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken(monkeypatch):

@@ -83,6 +83,14 @@ def test_nothing_is_moved_where_nothing_crosses(away_mm):
     assert crossing_agreement(images, poses, ranges, np.arange(len(images))) is None
 
 
+def test_one_pass_is_trained_where_the_other_is_held_out():
+    images = two_passes()
+    given = Dataset("hand", images.select(np.arange(COUNT)), images.select(np.arange(COUNT, 2 * COUNT)))
+    path = agreed_path(given)
+    assert path.crossing is None
+    assert path.train is given.train.poses
+
+
 def test_how_points_move_with_a_twist_is_the_slope_of_the_motion():
     sweep = two_passes().select(np.arange(0, 2 * COUNT, 20))
     crossing = _Crossing(sweep, np.zeros(len(sweep), np.int64), seed=0)

@@ -77,6 +77,27 @@ def test_sweeps_are_told_apart_by_the_jump_of_the_path():
     assert sweep_ranges(seen(poses)) == [range(40), range(40, 73)]  # three frames are no sweep of their own
 
 
+@pytest.mark.parametrize("shake_mm", [0.0, 0.02])
+def test_a_probe_that_rests_does_not_begin_a_new_sweep_with_each_step(shake_mm):
+    rested = freehand_path(40)[[*range(20), *[20] * 100, *range(20, 40)]]
+    assert sweep_ranges(seen(shaken(rested, shake_mm, 0.0))) == [range(140)]
+
+
+@pytest.mark.parametrize("total_deg", [170.0, 360.0, 800.0])
+def test_the_noise_of_a_probe_that_turns_far_is_measured_and_removed(total_deg):
+    count = 120
+    true = freehand_path(count) @ poses_of(np.linspace(0.0, total_deg, count)[:, None] * [[0.0, 0.0, 1.0]], [[0.0] * 3])
+    given, ranges = shaken(true, 0.6, 0.6), [range(count)]
+    noise = tracker_noise(given, ranges)
+    assert noise.turn_deg == pytest.approx(0.6, rel=0.25)
+    errors = [
+        np.array([angle_deg(a[:3, :3] @ b[:3, :3].T) for a, b in zip(some, true, strict=True)])
+        for some in (given, without_noise(given, ranges))
+    ]
+    assert errors[1].mean() < 0.5 * errors[0].mean()
+    assert errors[1].max() < 0.8 * errors[0].max()
+
+
 @pytest.mark.parametrize(("mm", "deg"), [(0.6, 0.6), (1.0, 0.5)])
 def test_the_noise_of_a_tracker_is_measured_and_removed(mm, deg):
     true = freehand_path(120)
