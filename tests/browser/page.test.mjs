@@ -471,8 +471,8 @@ test("the worked example of the simulator's page scores a run", async () => {
   writeFileSync(path.join(site.folder, "task.html"), /```html\n([^`]*<title>Find the plane.*?)```/s.exec(text)[1]);
   const page = await browser.newPage();
   await page.goto(`${url}task.html`);
-  await page.waitForSelector("ultragray-probe[src]");
-  await page.evaluate(() => new Promise((resolve) => document.querySelector("ultragray-probe").addEventListener("frame", resolve, { once: true })));
+  const isDrawn = () => document.querySelector("ultragray-probe[src]")?.shadowRoot.querySelector("canvas").width === 128;
+  await page.waitForFunction(isDrawn, null, { timeout: TIMEOUT_MS }); // its event may be over by now
   await page.focus("ultragray-probe");
   await page.keyboard.press("f");
   await page.keyboard.press("f");

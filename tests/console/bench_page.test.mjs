@@ -203,9 +203,12 @@ describe("on a phone and enlarged", () => {
   for (const size of [{ width: 390, height: 844 }, { width: 640, height: 400 }])
     it(`nothing lies beside the screen at ${size.width} pixels`, async () => {
       const page = await openPage(at, "#/train", size);
-      for (const hash of ["#/train", "#/train?show=settings", "#/train?show=render", "#/train?show=jobs"]) {
+      const current = page.getByRole("navigation", { name: "Sections" }).locator('[aria-current="page"]');
+      for (const [hash, section] of [["#/train", "Sweep and training"], ["#/train?show=settings", "Sweep and training"], ["#/train?show=render", "Render a data set"], ["#/train?show=jobs", "Jobs"]]) {
         await page.evaluate((to) => (location.hash = to), hash);
-        await page.waitForTimeout(600);
+        await current.getByText(section).waitFor();
+        await page.locator(".skeleton").waitFor({ state: "detached" });
+        await laidOut(page);
         assert.deepEqual(await tooWide(page), [], hash);
         await picture(page, `train-${size.width}-${hash.split("=")[1] ?? "sweep"}`);
       }

@@ -12,7 +12,7 @@ const READ = ["alt", "aria-description", "aria-label", "aria-placeholder", "aria
 /** Of our components: properties with words in them. */
 const WORDS = [...READ, "description", "hint", "missing", "question", "what", "xLabel", "yLabel"];
 /** What is the same in every language: units, symbols, names of metrics and formats. */
-const SAME = /^(?:[\d\s\p{P}\p{S}]|mm|cm|dB|ms|px|min|PSNR|MS-SSIM|GMS|GMSD|JSON|PNG|DICOM|MP4|WebM|CSV|NumPy|ROS ?2?|TUM|PLUS|curl|Python|gRPC|WebSocket|OpenIGTLink|MPR|UltraG-Ray|[XYZxyzRLAPSIHFLUV])*$/u;
+const SAME = /^(?:[\d\s\p{P}\p{S}]|mm|cm|N|dB|ms|px|min|PSNR|MS-SSIM|GMS|GMSD|JSON|PNG|DICOM|MP4|WebM|CSV|NumPy|ROS ?2?|TUM|PLUS|curl|Python|gRPC|WebSocket|OpenIGTLink|MPR|UltraG-Ray|[XYZxyzRLAPSIHFLUV])*$/u;
 
 /** "file:line: text" of every text that is written in a template. */
 export function textsOutsideTheCatalogues() {

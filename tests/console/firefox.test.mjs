@@ -51,9 +51,8 @@ describe("in Firefox", { skip: missing ?? false }, () => {
     const moved = await until(() => stateInFirefox(page, IMAGE), ({ print }) => print !== first.print, "the slider does nothing");
     await page.focus(IMAGE);
     await page.keyboard.down("ArrowRight");
-    await new Promise((resolve) => setTimeout(resolve, 300));
-    await page.keyboard.up("ArrowRight");
     await until(() => stateInFirefox(page, IMAGE), ({ print }) => print !== moved.print, "the arrow keys do nothing");
+    await page.keyboard.up("ArrowRight");
     await photograph(page, "scan");
     assert.deepEqual([faultsOf(page), page.foreign, await refusedSources(page)], [[], [], []]);
     await page.close();

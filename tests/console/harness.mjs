@@ -148,7 +148,7 @@ export async function picture(page, name) {
   mkdirSync(SCREENSHOTS, { recursive: true });
   for (const scheme of ["light", "dark"]) {
     await page.emulateMedia({ colorScheme: scheme });
-    await page.waitForTimeout(600); // the 3D view follows when there is time
+    await laidOut(page);
     await page.screenshot({ path: path.join(SCREENSHOTS, `${name}-${scheme}.png`) });
   }
 }

@@ -107,7 +107,7 @@ describe("corrected poses", () => {
       const box = await panel.getByRole("img", { name: title }).boundingBox();
       assert.ok(box.y + box.height <= 900 && box.x + box.width <= 1440, `${title} is out of sight`);
     }
-    await panel.getByText("training view 106").first().waitFor(); // as the bar of the sweep says
+    await until(() => panel.innerText(), (text) => text.includes("training view 106"), "not the view that the bar of the sweep says");
     await panel.getByText("1.05", { exact: true }).waitFor();
     await page.getByLabel("Place in the training sweep").fill("10");
     await panel.getByText("training view 11").first().waitFor();

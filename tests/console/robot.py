@@ -2,14 +2,13 @@
 
 `x Y`: a pose with its place at Y mm along the scene's x.
 `run HZ`: a pose along y, HZ times a second, until the next line.
-Each answer is told as a line: the sequence, the time in milliseconds since 1970, and the x that was rendered.
+Each answer is told as a line: the sequence and the x that was rendered.
 """
 
 import json
 import select
 import struct
 import sys
-import time
 
 from websockets.sync.client import connect
 
@@ -33,7 +32,7 @@ def ask(stream, sequence):
         return
     (length,) = struct.unpack_from("<I", answer)
     header = json.loads(answer[4 : 4 + length])
-    tell(header["sequence"], round(1000 * time.time()), header["pose"][0][3])
+    tell(header["sequence"], header["pose"][0][3])
 
 
 with connect(address, max_size=None) as stream:

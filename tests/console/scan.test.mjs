@@ -103,8 +103,8 @@ describe("scan", () => {
     const { page } = await openScan(at);
     const room = page.getByTestId("room");
     await room.locator("canvas").waitFor();
-    await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 200, "no 3D view");
-    await page.waitForTimeout(1500); // the Gaussians are on their way
+    await page.getByTestId("legend").waitFor();
+    await page.getByText("refining …").waitFor({ state: "detached" });
     const changes = async (change, what) => {
       const before = (await room.screenshot()).toString("base64");
       await change();

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { focused, goTo, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { focused, goTo, laidOut, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
@@ -107,6 +107,13 @@ describe("a slider", () => {
     await until(() => tilt.inputValue(), (value) => Number(value) > 0, "keys do not leave 0");
     await page.mouse.dblclick(x + width * 0.8, middle);
     await until(() => tilt.inputValue(), (value) => Number(value) === 0, "a double click does not bring it back");
+    const gain = page.getByRole("slider", { name: "Gain", exact: true });
+    await gain.evaluate((slider) => {
+      slider.valueAsNumber = 12;
+      for (const type of ["input", "dblclick"]) slider.dispatchEvent(new Event(type, { bubbles: true })); // back before it was drawn
+    });
+    await laidOut(page);
+    assert.equal(await gain.inputValue(), "0", "the slider stays where the gain is not");
     assert.ok((await poseOf(page)).quaternion.w > 0.99);
   });
 });

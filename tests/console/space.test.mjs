@@ -93,7 +93,6 @@ describe("the scene in space", () => {
       await probe.selectOption(kind);
       await until(() => canvasState(page, IMAGE), (state) => state.print !== print && state.mean > 1, `no ${kind} image`);
       await page.getByTestId("depth-ruler").getByText("1", { exact: true }).first().waitFor();
-      await page.waitForTimeout(1500); // the 3D view follows when there is time
       await picture(page, `scan-${kind}`);
       const stored = page.getByRole("button", { name: "Scan lines" });
       if ((await stored.count()) === 0) continue;

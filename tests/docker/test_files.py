@@ -21,7 +21,7 @@ from ultragray_service.cli.app import app as command_line
 from ultragray_service.environment import OTHER_VARIABLES
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 
-from ..distribution.projects import pyproject
+from ..distribution.projects import FOLDERS, names_of, project, pyproject
 from ..documents.tables import rows
 from ..surroundings import ROOT
 from .envoy import FOLDER
@@ -48,6 +48,16 @@ def test_what_is_copied_is_there_and_reaches_the_build():
 def test_extras_are_those_of_the_project():
     wanted = re.search(r"'\.\[([a-z,]+)\]'", DOCKERFILE)
     assert set(wanted[1].split(",")) <= set(pyproject("ultragray")["project"]["optional-dependencies"])
+
+
+@pytest.mark.parametrize("file", [DOCKERFILE, DOCKERFILE_OF_ROS], ids=["service", "ros"])
+def test_an_image_gets_all_projects_that_its_projects_need(file):
+    (words,) = re.findall(r"pip install (.*\./proto.*)", file)
+    folders = {ROOT / word.strip("'").partition("[")[0] for word in words.split() if word.lstrip("'").startswith(".")}
+    names = {name for name, folder in FOLDERS.items() if folder in folders}
+    assert len(names) == len(folders)
+    needed = {one for name in names for one in names_of(project(name)["dependencies"])}
+    assert needed & FOLDERS.keys() <= names
 
 
 def test_torch_is_one_that_the_project_takes():

@@ -72,7 +72,7 @@ class FuzzedService:
         self.require_alive()
         assert np.array_equal(self._render(), self._frame), "the frame at the end is not the one of the beginning"
         said = self.running.log_path.read_text()
-        assert "Traceback" not in said, said[said.index("Traceback") - 2000 :][:6000]
+        assert "Traceback" not in said, said[max(0, said.index("Traceback") - 2000) :][:6000]
         errors = [record for record in self.running.log() if record["level"] == "error"]
         assert not errors, errors[:3]
         wait_until(self._has_settled, within_s=at_this_load(SETTLE_S), every_s=SAMPLE_EVERY_S)

@@ -83,13 +83,11 @@ def messages():
 
 
 def talk(address, data):
-    """Sends, asks for the state, and waits for its answer or for the end of the connection."""
+    """Sends, asks for the state, and waits for its answer. Raises ConnectionResetError where none comes."""
     with socket.create_connection(address, timeout=TIMEOUT_S) as peer, contextlib.suppress(ConnectionError):
         peer.sendall(data + pack_message(Message("GET_STATUS", "", timestamp=LAST)))
         with peer.makefile("rb") as answers:
-            while header := answers.read(HEADER_BYTES):
-                if len(header) < HEADER_BYTES:
-                    return
+            while len(header := answers.read(HEADER_BYTES)) == HEADER_BYTES:
                 told = unpack_header(header)
                 answers.read(told.body_bytes)
                 if told.type_name == "STATUS" and told.timestamp == LAST:
