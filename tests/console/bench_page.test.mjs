@@ -207,7 +207,7 @@ describe("on a phone and enlarged", () => {
       for (const [hash, section] of [["#/train", "Sweep and training"], ["#/train?show=settings", "Sweep and training"], ["#/train?show=render", "Render a data set"], ["#/train?show=jobs", "Jobs"]]) {
         await page.evaluate((to) => (location.hash = to), hash);
         await current.getByText(section).waitFor();
-        await page.locator(".skeleton").waitFor({ state: "detached" });
+        await until(() => page.locator(".skeleton").count(), (count) => count === 0, `${hash} is not whole`);
         await laidOut(page);
         assert.deepEqual(await tooWide(page), [], hash);
         await picture(page, `train-${size.width}-${hash.split("=")[1] ?? "sweep"}`);
