@@ -195,6 +195,7 @@ class GrpcStream(_Stream):
 
     def __init__(self, channel):
         self._call = rendering_pb2_grpc.RenderServiceStub(channel).RenderStream()
+        self._writing = asyncio.Lock()  # gRPC takes one message at a time
         self._sequence = 0
         self._first = {"settings": SETTINGS, "mode": rendering_pb2.STREAM_MODE_LATEST, "window": 2}
 
@@ -206,14 +207,18 @@ class GrpcStream(_Stream):
         self._sequence += 1
         about = {"sequence": self._sequence, "client_time_ns": time.monotonic_ns(), **self._first}
         self._first = {}
-        await self._call.write(rendering_pb2.RenderStreamRequest(pose=MESSAGE, **about))
+        await self._write(pose=MESSAGE, **about)
 
     async def receive(self):
         frame = await self._call.read()
-        await self._call.write(rendering_pb2.RenderStreamRequest(acknowledged=frame.sequence))
+        await self._write(acknowledged=frame.sequence)
         if frame.error.reason:
             raise Refused(frame.error.reason)
         return int(frame.client_time_ns)
+
+    async def _write(self, **contents):
+        async with self._writing:
+            await self._call.write(rendering_pb2.RenderStreamRequest(**contents))
 
     async def close(self):
         self._call.cancel()
