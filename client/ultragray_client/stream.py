@@ -66,16 +66,12 @@ class _PoseStream:
         self._lost += self._unanswered.take_lost()
         return opening
 
-    def _open_again(self, without_memory: bool) -> None:
+    def _resume(self, *, without_memory: bool) -> None:
+        """Another call is opened now, for the poses that have no answer."""
         if without_memory:
             self._exchange.give_up_memory()
         else:
             self._is_resumed = True
-        self._open()
-
-    def _open(self) -> None:
-        """Starts a call for the poses that have no answer."""
-        raise NotImplementedError
 
     def _accepted(self, message: Any) -> Answer | None:
         """The answer that a message is; None: of a service that stops, and refused the pose."""
@@ -251,7 +247,8 @@ class FrameStream(_PoseStream):
             if call is not self._call:
                 return
             if failure is not None and self._exchange.goes_without_memory(failure) and not self._cancelled:
-                self._open_again(without_memory=True)  # at once: perhaps nobody reads before all poses are sent
+                self._resume(without_memory=True)  # at once: perhaps nobody reads before all poses are sent
+                self._open()
                 return
             self._closed, self._failure = True, failure
             self._changed.notify_all()
@@ -285,7 +282,8 @@ class FrameStream(_PoseStream):
                 if self._cancelled:
                     raise error
                 if self._call is broken:
-                    self._open_again(gives_up_memory)
+                    self._resume(without_memory=gives_up_memory)
+                    self._open()
         except ClientError as final:
             with self._changed:
                 self._closed, self._failure = True, final
@@ -485,7 +483,8 @@ class AsyncFrameStream(_PoseStream):
                 return False
             await asyncio.sleep(pause_s)
             if self._call is broken:
-                self._open_again(gives_up_memory)
+                self._resume(without_memory=gives_up_memory)
+                self._open()
                 self._waiting_to_go_on = 0
                 self._resending = asyncio.ensure_future(self._resend())
         except ClientError as final:

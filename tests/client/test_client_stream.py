@@ -66,19 +66,19 @@ def test_latency_counts_from_the_measurement(client):
 
 
 def test_frames_are_those_of_when_they_are_seen(client):
-    begun_ns, frames = time.monotonic_ns(), []
+    begun_ns, frames, is_foretold = time.monotonic_ns(), [], False
     with client.stream("demo", RenderSettings(height=8, width=8), seen_after_ms=100.0) as stream:
         deadline = Deadline(60)
-        while len(frames) < 60 or frames[-60].prediction.error_mm is None:
+        # Of a motion 1/(1 + 2/n) is believed in after n predictions in the last seconds, few while a machine is busy.
+        while len(frames) < 60 or frames[-60].prediction.error_mm is None or not is_foretold:
             measured_ns = time.monotonic_ns() - 20_000_000
             x_mm = 2e-8 * (measured_ns - begun_ns)  # 20 mm/s
             stream.send(moved(x_mm), measured_ns=measured_ns)
             frames.append(stream.receive())
+            motion_mm = 0.02 * frames[-1].prediction.ahead_ms
+            is_foretold = frames[-1].pose[0, 3] - x_mm == pytest.approx(motion_mm, rel=0.1)
             assert not deadline.passed
-    motion_mm = 0.02 * frames[-1].prediction.ahead_ms
-    assert motion_mm > 0.02 * (100.0 + 20.0)
-    # Of a motion 1/(1 + 2/n) is believed in after n predictions in the last seconds, few on a machine that is busy.
-    assert frames[-1].pose[0, 3] - x_mm == pytest.approx(motion_mm, rel=0.3)
+    assert frames[-1].prediction.ahead_ms > 100.0 + 20.0
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         assert stream.receive().prediction is None
