@@ -12,13 +12,13 @@
 #include <optional>
 
 #include "adam.hpp"
+#include "assess.hpp"
 #include "between.hpp"
 #include "loss.hpp"
 #include "pressing.hpp"
 #include "render.hpp"
 #include "speckle.hpp"
 #include "stiffness.hpp"
-#include "views.hpp"
 
 namespace nb = nanobind;
 using namespace ultragray;
@@ -47,6 +47,7 @@ using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using FreeGrey = nb::ndarray<uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Labels = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using DoubleMatrix = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using FreeDoubleMatrix = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Shafts = nb::ndarray<const double, nb::shape<-1, -1, 2, 3>, nb::c_contig, nb::device::cpu>;
 using FreeFields = nb::ndarray<float, nb::ndim<5>, nb::c_contig, nb::device::cpu>;
 using FreeMaps = nb::ndarray<double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>;
@@ -465,30 +466,77 @@ NB_MODULE(_cpu, m) {
         nb::arg("plane_phases").noconvert(), nb::arg("column_phases").noconvert(), nb::arg("threads"),
         nb::arg("instruction_set"));
 
-    m.def(
-        "measure_views",
-        [](Matrix points, Floats axes, Matrix offsets, Vector angles, Vector facing, bool fanned, float slope, float scale,
-           float across, float half, float by_z, float near_mm, float far_mm, float least_mm, float most_mm,
-           float mm_by_degree, const std::string& instruction_set, FreeFloats measures, FreeCounts nearest,
-           FreeFloats around) {
-            const size_t count = points.shape(0), views = offsets.shape(1);
-            if (points.shape(1) != 3 || offsets.shape(0) != 3 || axes.size() != 9 * views || angles.shape(0) != views ||
-                facing.shape(0) != views || around.size() != views || measures.size() != 3 * count ||
-                nearest.shape(0) != count || views % kMaxLanes || views == 0)
-                throw std::invalid_argument("the shapes of points and views do not agree");
-            const ViewImages images{axes.data(), offsets.data(), int64_t(views), fanned,  slope, scale,
-                                    across,      half,           by_z,           near_mm, far_mm};
-            float* out = measures.data();
-            choose_kernels(instruction_set)
-                .measure_views(points.data(), int(count), angles.data(), facing.data(), images,
-                               {least_mm, most_mm, mm_by_degree},
-                               {out, out + count, out + 2 * count, nearest.data(), around.data()});
-        },
-        nb::arg("points").noconvert(), nb::arg("axes").noconvert(), nb::arg("offsets").noconvert(),
-        nb::arg("angles").noconvert(), nb::arg("facing").noconvert(), nb::arg("fanned"), nb::arg("slope"), nb::arg("scale"),
-        nb::arg("across"), nb::arg("half"), nb::arg("by_z"), nb::arg("near_mm"), nb::arg("far_mm"), nb::arg("least_mm"),
-        nb::arg("most_mm"), nb::arg("mm_by_degree"), nb::arg("instruction_set"), nb::arg("measures").noconvert(),
-        nb::arg("nearest").noconvert(), nb::arg("around").noconvert());
+    nb::class_<TrainingViews>(m, "TrainingViews")
+        .def(
+            "__init__",
+            [](TrainingViews* self, Poses poses, bool fanned, float slope, float scale, float across, float half, float by_z,
+               float near_mm, float far_mm, const std::string& instruction_set) {
+                if (poses.shape(0) == 0) throw std::invalid_argument("there must be a view");
+                new (self) TrainingViews(poses.data(), poses.shape(0),
+                                         {fanned, slope, scale, across, half, by_z, near_mm, far_mm}, instruction_set);
+            },
+            nb::arg("poses").noconvert(), nb::arg("fanned"), nb::arg("slope"), nb::arg("scale"), nb::arg("across"),
+            nb::arg("half"), nb::arg("by_z"), nb::arg("near_mm"), nb::arg("far_mm"), nb::arg("instruction_set"))
+        .def(
+            "measure",
+            [](const TrainingViews& self, Poses poses, DoubleMatrix points, FreeDoubleMatrix nearest_mm,
+               FreeDoubleMatrix distance_mm, FreeDoubleMatrix interpolation_mm, FreeDoubleMatrix angle_deg,
+               FreeDoubleMatrix weights, FreeDoubleMatrix around_mm) {
+                const size_t count = poses.shape(0), each = points.shape(0);
+                if (points.shape(1) != 3 || each == 0) throw std::invalid_argument("points must be [K, 3]");
+                const auto put = [&](const FreeDoubleMatrix& into, size_t pose, const std::vector<double>& values) {
+                    if (into.shape(0) != count || into.shape(1) != values.size())
+                        throw std::invalid_argument("the shapes of poses, points and measures do not agree");
+                    std::copy(values.begin(), values.end(), into.data() + pose * values.size());
+                };
+                for (size_t c = 0; c < count; ++c) {
+                    const ViewMeasures found = self.measure(poses.data() + 16 * c, points.data(), each);
+                    put(nearest_mm, c, found.nearest_mm), put(distance_mm, c, found.distance_mm);
+                    put(interpolation_mm, c, found.interpolation_mm), put(angle_deg, c, found.angle_deg);
+                    put(weights, c, found.weights), put(around_mm, c, found.around_mm);
+                }
+            },
+            nb::arg("poses").noconvert(), nb::arg("points").noconvert(), nb::arg("nearest_mm").noconvert(),
+            nb::arg("distance_mm").noconvert(), nb::arg("interpolation_mm").noconvert(), nb::arg("angle_deg").noconvert(),
+            nb::arg("weights").noconvert(), nb::arg("around_mm").noconvert())
+        .def(
+            "interpolation_mm",
+            [](const TrainingViews& self, Matrix points, FreeDoubles found) {
+                if (points.shape(1) != 3 || found.shape(0) != points.shape(0))
+                    throw std::invalid_argument("the shapes of points and distances do not agree");
+                self.interpolation_mm(points.data(), points.shape(0), found.data());
+            },
+            nb::arg("points").noconvert(), nb::arg("found").noconvert());
+
+    nb::class_<ConfidenceFormula>(m, "ConfidenceFormula")
+        .def(
+            "__init__",
+            [](ConfidenceFormula* self, std::array<double, 5> weights, double black_ms_ssim, std::vector<double> hardness,
+               std::optional<std::array<double, 3>> support, std::optional<double> fitted_to_mm) {
+                new (self) ConfidenceFormula{weights, black_ms_ssim, std::move(hardness), {}, fitted_to_mm};
+                if (support) self->support = {(*support)[0], (*support)[1], (*support)[2]};
+            },
+            nb::arg("weights"), nb::arg("black_ms_ssim"), nb::arg("hardness"), nb::arg("support").none(),
+            nb::arg("fitted_to_mm").none())
+        .def(
+            "predict",
+            [](const ConfidenceFormula& self, DoubleMatrix distance_mm, DoubleMatrix interpolation_mm,
+               DoubleMatrix angle_deg, DoubleMatrix weights) {
+                const size_t count = distance_mm.shape(0), each = distance_mm.shape(1), views = self.hardness.size();
+                for (const DoubleMatrix* one : {&distance_mm, &interpolation_mm, &angle_deg})
+                    if (one->shape(0) != count || one->shape(1) != each)
+                        throw std::invalid_argument("the shapes of the measures do not agree");
+                if (weights.shape(0) != count || weights.shape(1) != views)
+                    throw std::invalid_argument("there must be a weight for each view");
+                std::vector<double> found;
+                for (size_t c = 0; c < count; ++c)
+                    found.push_back(self.predict(distance_mm.data() + c * each, interpolation_mm.data() + c * each,
+                                                 angle_deg.data() + c * each, each, weights.data() + c * views));
+                return found;
+            },
+            nb::arg("distance_mm").noconvert(), nb::arg("interpolation_mm").noconvert(), nb::arg("angle_deg").noconvert(),
+            nb::arg("weights").noconvert())
+        .def("limited", &ConfidenceFormula::limited, nb::arg("confidence"), nb::arg("supported_share"));
 
     m.def("instruction_sets", &instruction_sets);
 }

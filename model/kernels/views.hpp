@@ -5,16 +5,20 @@
 
 namespace ultragray {
 
-// The images of P views, P a multiple of kMaxLanes: axis a of a view's frame as [a, xyz, P], and the origin's coordinate
-// along each, [a, P]; mm. A point at x and z of that frame lies scale |x - slope z| - across z - half mm off the outermost
-// scan lines (below 0: between them), and at a depth of z * by_z or, where the lines fan out from the origin, of its
+// A point at x and z of a probe's frame, mm, lies scale |x - slope z| - across z - half mm off the outermost scan lines of
+// its image (below 0: between them), and at a depth of z * by_z or, where the lines fan out from the origin, of its
 // distance to that.
-struct ViewImages {
-    const float *axes, *offsets;
-    int64_t count;
+struct ImageEdges {
     bool fanned;
     float slope, scale, across, half, by_z;
     float near, far;  // the depths of the image
+};
+
+// The images of P views, P a multiple of kMaxLanes: axis a of a view's frame as [a, xyz, P], and the origin's coordinate
+// along each, [a, P]; mm.
+struct ViewImages : ImageEdges {
+    const float *axes, *offsets;
+    int64_t count;
 };
 
 // Limits of distances in mm, and what is added to one for each degree between the frames, to choose the nearest view.

@@ -3,18 +3,12 @@
 #include <algorithm>
 #include <limits>
 
-#include "../kernels/kernel.hpp"
 
 namespace ultragray::library {
 namespace {
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 constexpr int kPointsPerSide = 6;
-constexpr float kMmByDegree = 0.02f;
-constexpr double kFarMm = 20.0, kSmallestMm = 1e-6, kNeighbourhoodMm = 3.0, kReach = 1.3, kLeastSum = 1e-9;
-constexpr double kNearMm = 0.3, kDistanceMm = 5.0, kAngleDeg = 10.0;
-
-double logistic(double value) { return 1.0 / (1.0 + std::exp(-std::clamp(value, -500.0, 500.0))); }
 
 double mean_of(const std::vector<double>& values) {
     double sum = 0;
@@ -22,65 +16,35 @@ double mean_of(const std::vector<double>& values) {
     return sum / double(values.size());
 }
 
-ViewImages images_of(const Probing& probe, const float* axes, const float* offsets, int64_t count) {
+ImageEdges edges_of(const Probing& probe) {
     const float near = float(probe.near_mm), far = float(probe.far_mm);
-    if (probe.wraps()) return {axes, offsets, count, true, 0.0f, 0.0f, 0.0f, 0.0f, 1.0f, near, far};  // there are no edges
+    if (probe.wraps()) return {true, 0.0f, 0.0f, 0.0f, 0.0f, 1.0f, near, far};  // there are no edges
     const double angle = (probe.is_angular() ? probe.span / 2 : probe.steering_deg) * (kPi / 180.0);
     const double x = std::sin(angle), z = std::cos(angle);
-    if (probe.is_angular()) return {axes, offsets, count, true, 0.0f, float(z), float(x), 0.0f, 1.0f, near, far};
-    return {axes, offsets, count, false, float(x / z), float(z), 0.0f, float(probe.span / 2 * z), float(1.0 / z), near, far};
+    if (probe.is_angular()) return {true, 0.0f, float(z), float(x), 0.0f, 1.0f, near, far};
+    return {false, float(x / z), float(z), 0.0f, float(probe.span / 2 * z), float(1.0 / z), near, far};
 }
 
 }  // namespace
 
-TrainingViews::TrainingViews(const std::vector<Pose>& poses, const Probing& probe)
-    : probe_(probe), count_(poses.size()), filled_(poses) {
-    while (filled_.size() % kMaxLanes) filled_.push_back(poses.back());
-    for (int axis = 0; axis < 3; ++axis) {
-        for (int d = 0; d < 3; ++d)
-            for (const Pose& pose : filled_) axes_.push_back(float(pose.turn[d][axis]));
-        for (const Pose& pose : filled_) offsets_.push_back(float(dot(pose.axis(axis), pose.origin)));
+TrainingViews training_views(const std::vector<Pose>& poses, const Probing& probe) {
+    std::vector<double> matrices;
+    for (const Pose& pose : poses) {
+        const std::array<double, 16> matrix = pose.matrix();
+        matrices.insert(matrices.end(), matrix.begin(), matrix.end());
     }
+    return {matrices.data(), poses.size(), edges_of(probe), "auto"};
 }
 
-ViewMeasures TrainingViews::measure(const Pose& pose, const Probing& probe, int points_per_side) const {
-    const size_t views = filled_.size(), count = size_t(points_per_side) * points_per_side;
-    std::vector<float> points, angles, facing, distances(3 * count), around(views);
+ViewMeasures measure(const TrainingViews& views, const Pose& pose, const Probing& probe, int points_per_side) {
+    std::vector<double> points;
     for (int row = 0; row < points_per_side; ++row)
         for (int column = 0; column < points_per_side; ++column) {
             const Ray ray = probe.ray(probe.across(column, points_per_side));
-            const Vector point = pose.at(ray.at(probe.depth_mm(row, points_per_side)));
-            for (const double one : point) points.push_back(float(one));
+            const Vector point = ray.at(probe.depth_mm(row, points_per_side));
+            points.insert(points.end(), point.begin(), point.end());
         }
-    for (const Pose& view : filled_) {
-        double trace = 0;
-        for (int d = 0; d < 3; ++d) trace += dot(pose.axis(d), view.axis(d));
-        angles.push_back(float(std::acos(std::clamp(0.5 * (trace - 1.0), -1.0, 1.0)) * (180.0 / kPi)));
-        facing.push_back(float(dot(pose.axis(1), view.axis(1))));  // below 0: front and back change places
-    }
-    std::vector<int64_t> place(count);
-    float *nearest = distances.data(), *before = nearest + count, *behind = before + count;
-    const ViewLimits limits{float(kSmallestMm), float(1e3 * kFarMm), kMmByDegree};
-    choose_kernels("auto").measure_views(points.data(), int(count), angles.data(), facing.data(),
-                                         images_of(probe_, axes_.data(), offsets_.data(), int64_t(views)), limits,
-                                         {nearest, before, behind, place.data(), around.data()});
-    ViewMeasures found;
-    for (size_t k = 0; k < count; ++k) {
-        const double a = before[k], b = behind[k];
-        found.nearest_mm.push_back(nearest[k]);
-        found.distance_mm.push_back(std::clamp(double(nearest[k]), kSmallestMm, kFarMm));
-        found.interpolation_mm.push_back(std::min(a * b / std::max(a + b, kLeastSum), kFarMm));
-        found.angle_deg.push_back(angles[place[k]]);
-    }
-    const double least = *std::min_element(around.begin(), around.begin() + count_);
-    const double reach = std::max(kNeighbourhoodMm, kReach * least);
-    double sum = 0;
-    for (size_t v = 0; v < count_; ++v) {
-        found.weights.push_back(std::exp(std::pow(least / reach, 2) - std::pow(around[v] / reach, 2)));
-        sum += found.weights.back();
-    }
-    for (double& weight : found.weights) weight /= sum;
-    return found;
+    return views.measure(pose.matrix().data(), points.data(), points.size() / 3);
 }
 
 ConfidenceModel ConfidenceModel::read(const Value& value) {
@@ -95,21 +59,21 @@ ConfidenceModel ConfidenceModel::read(const Value& value) {
     Fields fields(value, "confidence");
     fields.require("version", [&](const Value& it) { it.integer({double(kVersion), double(kVersion), {}}); });
     fields.require("weights", [&](const Value& it) {
-        model.weights = it.vector<5>({});
-        for (size_t k = 1; k < model.weights.size(); ++k) it.at(k).number(at_least_0);
+        model.formula.weights = it.vector<5>({});
+        for (size_t k = 1; k < model.formula.weights.size(); ++k) it.at(k).number(at_least_0);
     });
-    fields.require("black_ms_ssim", [&](const Value& it) { model.black_ms_ssim = it.number(share); });
-    fields.require("hardness", [&](const Value& it) { model.hardness = it.numbers({}, {}); });
+    fields.require("black_ms_ssim", [&](const Value& it) { model.formula.black_ms_ssim = it.number(share); });
+    fields.require("hardness", [&](const Value& it) { model.formula.hardness = it.numbers({}, {}); });
     fields.require("fitted_on", [&](const Value& it) { it.integer({1.0, {}, {}}); });
     fields.require("error", [&](const Value& it) { it.number(share); });
     fields.require("support", unless_null([&](const Value& it) {
                        Fields support(it, "support");
-                       auto& [gain, share, reach_mm] = model.support.emplace();
+                       auto& [gain, share, reach_mm] = model.formula.support.emplace();
                        for (auto [name, into] : {std::pair("gain", &gain), {"share", &share}, {"reach_mm", &reach_mm}})
                            support.require(name, [&, into = into](const Value& one) { *into = one.number(positive); });
                        support.end();
                    }));
-    fields.require("fitted_to_mm", unless_null([&](const Value& it) { model.fitted_to_mm = it.number(at_least_0); }));
+    fields.require("fitted_to_mm", unless_null([&](const Value& it) { model.formula.fitted_to_mm = it.number(at_least_0); }));
     fields.require("uncertainty", unless_null([&](const Value& it) {
                        Fields uncertainty(it, "uncertainty");
                        Uncertainty& of = model.uncertainty.emplace();
@@ -123,42 +87,22 @@ ConfidenceModel ConfidenceModel::read(const Value& value) {
     return model;
 }
 
-// c = b + (1 - b) mean over points of σ(w0 - w1 log(1 + i/0.3 mm) - w2 d/5 mm - w3 φ/10° - w4 h), limited by the support
-// that is expected at the pose.
-double ConfidenceModel::predict(const ViewMeasures& measures) const {
-    double hard = 0, sum = 0, within = 0;
-    for (size_t v = 0; v < hardness.size(); ++v) hard += measures.weights[v] * hardness[v];
-    const size_t count = measures.distance_mm.size();
-    for (size_t k = 0; k < count; ++k) {
-        double distance = measures.distance_mm[k];
-        if (support) within += std::exp(-std::pow(distance / support->reach_mm, 2));
-        if (fitted_to_mm) distance += std::max(distance - *fitted_to_mm, 0.0);
-        sum += logistic(weights[0] - weights[1] * std::log1p(measures.interpolation_mm[k] / kNearMm) -
-                        weights[2] * (distance / kDistanceMm) - weights[3] * (measures.angle_deg[k] / kAngleDeg) -
-                        weights[4] * hard);
-    }
-    const double expected = black_ms_ssim + (1.0 - black_ms_ssim) * (sum / double(count));
-    return support ? limited(expected, support->share * (within / double(count))) : expected;
-}
-
-double ConfidenceModel::limited(double confidence, double supported_share) const {
-    if (!support) return confidence;
-    return std::min(confidence, black_ms_ssim + (1.0 - black_ms_ssim) * std::min(1.0, support->gain * supported_share));
-}
-
 Extrapolation assess(const TrainingViews* views, const ConfidenceModel* model, const Pose& pose, const Probing& probe) {
     Extrapolation found{kNaN, kNaN, kNaN, kNaN, kNaN, kNaN, kNaN};
     if (views == nullptr) return found;
-    const ViewMeasures measures = views->measure(pose, probe, kPointsPerSide);
+    const ViewMeasures measures = measure(*views, pose, probe, kPointsPerSide);
     found.distance_mm = mean_of(measures.nearest_mm);
     found.angle_deg = mean_of(measures.angle_deg);
-    if (model) found.confidence = model->predict(measures);
+    if (model)
+        found.confidence =
+            model->formula.predict(measures.distance_mm.data(), measures.interpolation_mm.data(),
+                                   measures.angle_deg.data(), measures.distance_mm.size(), measures.weights.data());
     return found;
 }
 
 void add_support(Extrapolation& found, const ConfidenceModel* model, double supported_share) {
     found.supported_share = supported_share;
-    if (model && !std::isnan(found.confidence)) found.confidence = model->limited(found.confidence, supported_share);
+    if (model && !std::isnan(found.confidence)) found.confidence = model->formula.limited(found.confidence, supported_share);
 }
 
 namespace {

@@ -139,8 +139,8 @@ LoadedScene::LoadedScene(Scene read) : scene(std::move(read)) {
     if (info.tissue_shares) tissue_ = std::make_unique<FollowingTissue>(scene);
     if (info.speckle) speckle = std::make_unique<SpeckleOfScene>(*info.speckle, poses_at_rest());
     if (!info.probe || scene.training_poses.empty()) return;
-    views = std::make_unique<TrainingViews>(scene.training_poses, Probing::of(*info.probe));
-    views_at_rest = std::make_unique<TrainingViews>(poses_at_rest(), Probing::of(*info.probe));
+    views = std::make_unique<TrainingViews>(training_views(scene.training_poses, Probing::of(*info.probe)));
+    views_at_rest = std::make_unique<TrainingViews>(training_views(poses_at_rest(), Probing::of(*info.probe)));
 }
 
 const Skin& LoadedScene::skin() const {
@@ -430,7 +430,7 @@ std::vector<float> View::attenuation(const std::vector<float>& transmittance) co
 }
 
 std::vector<float> View::uncertainty(const Sight& sight, const Planes& drawn) const {
-    const ViewMeasures measures = scene_->views_at_rest->measure(sight.at_rest, probe_, kUncertaintyPoints);
+    const ViewMeasures measures = measure(*scene_->views_at_rest, sight.at_rest, probe_, kUncertaintyPoints);
     return deviations(*scene_->confidence()->uncertainty, measures, {drawn.bmode, drawn.coverage, drawn.transmittance},
                       height_, width_);
 }

@@ -298,9 +298,9 @@ Scene Scene::read(const void* bytes, size_t size, Extent extent) {
     if (info.tissue_shares.has_value() == scene.rest_poses.empty() || (info.tissue_shares && !info.probe))
         throw Fault("tissue_shares, rest_poses (one or more) and a probe belong together");
     const size_t views = scene.training_poses.size();
-    if (info.confidence && info.probe && views && info.confidence->hardness.size() != views)
+    if (info.confidence && info.probe && views && info.confidence->formula.hardness.size() != views)
         throw Fault("confidence.hardness must have one number for each of " + std::to_string(views) +
-                    " training poses, got " + std::to_string(info.confidence->hardness.size()));
+                    " training poses, got " + std::to_string(info.confidence->formula.hardness.size()));
     return scene;
 }
 

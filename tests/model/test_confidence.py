@@ -167,9 +167,9 @@ def test_distance_beyond_what_it_was_fitted_on_counts_twice():
 
 
 def test_little_support_limits_the_confidence():
-    told = FITTED.limited(np.array([0.8, 0.2, 0.99]), np.array([0.2, 0.2, 0.7]))
+    told = [FITTED.limited(confidence, share) for confidence, share in ((0.8, 0.2), (0.2, 0.2), (0.99, 0.7))]
     assert told == pytest.approx([0.06 + 0.94 * 1.5 * 0.2, 0.2, 0.99])
-    assert replace(FITTED, support=None).limited(np.array([0.8]), np.array([0.0])) == [0.8]
+    assert replace(FITTED, support=None).limited(0.8, 0.0) == 0.8
 
 
 def test_a_pose_alone_is_taken_to_have_the_support_of_its_distance():

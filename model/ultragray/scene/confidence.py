@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -23,11 +23,7 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
-ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
 FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
-SMALLEST_MM = 1e-6  # of a distance: nearer ones count as this
-_TOGETHER = 16  # views that the kernel may take at once: their number is filled up to a multiple
-NEIGHBOURHOOD_MM = 3.0  # of views whose hardness counts; where all are farther away, the nearest ones count
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +33,7 @@ class ViewMeasures:
     distance: to the nearest training image. interpolation: a·b/(a + b) of the distances a, b to the nearest images on
     either side: half of either midway between two, all of it where there is one side only. Both count as at most
     FAR_MM; `nearest_mm` is the distance without that limit. angle: the rotation to the view of the nearest image.
+    weights: of a Gaussian over the mean distances to the views, about as wide as that to the nearest, 3 mm at least.
     """
 
     nearest_mm: FloatArray  # [C, K]
@@ -51,95 +48,50 @@ class TrainingViews:
 
     def __init__(self, poses: FloatArray, probe: Probe, *, instruction_set: str = "auto") -> None:
         self._count = len(poses)
-        filled = np.concatenate([poses, np.repeat(poses[-1:], -len(poses) % _TOGETHER, axis=0)])  # [P', 4, 4]
-        axes = filled[:, :3, :3].transpose(2, 1, 0)  # [axis, xyz, P']
-        self._rotations = filled[:, :3, :3].reshape(len(filled), 9)
-        self._elevations = axes[1]  # [xyz, P']
-        self._images: dict[str, Any] = {
+        self._views = _cpu.TrainingViews(
+            np.ascontiguousarray(poses),
             **probe.lines.edges._asdict(),
-            "axes": np.ascontiguousarray(axes, np.float32),
-            "offsets": np.ascontiguousarray(np.einsum("axp,px->ap", axes, filled[:, :3, 3]), np.float32),  # [axis, P']
-            "near_mm": probe.near_mm,
-            "far_mm": probe.far_mm,
-            "least_mm": SMALLEST_MM,
-            "most_mm": 1e3 * FAR_MM,  # of a side without a view
-            "mm_by_degree": ANGLE_MM_PER_DEG,
-            "instruction_set": instruction_set,
-        }
+            near_mm=probe.near_mm,
+            far_mm=probe.far_mm,
+            instruction_set=instruction_set,
+        )
 
     def __len__(self) -> int:
         return self._count
 
     def measure(self, poses: FloatArray, probe: Probe, points_per_side: int = POINTS_PER_SIDE) -> ViewMeasures:
-        """Measures poses [C, 4, 4] (mm, exact) of a probe, which need not be the views' own."""
-        distances, angles, around = self._measured(poses, probe, points_per_side)
-        nearest_mm, before, behind = distances
-        between = before * behind / np.maximum(before + behind, 1e-9)
-        least = around.min(axis=1, keepdims=True)
-        reach = np.maximum(NEIGHBOURHOOD_MM, 1.3 * least)
-        weights = np.exp((least / reach) ** 2 - (around / reach) ** 2)
-        return ViewMeasures(
-            nearest_mm,
-            np.minimum(np.maximum(nearest_mm, SMALLEST_MM), FAR_MM),
-            np.minimum(between, FAR_MM),
-            angles,
-            weights / weights.sum(axis=1, keepdims=True),
-        )
+        """Measures poses [C, 4, 4] (mm, exact) of a probe, which need not be the views' own.
+
+        The nearest view of a point is that of the least distance + 0.02 mm for each degree between the frames: of two
+        about as near, the less turned one.
+        """
+        return self._measured(poses, probe, points_per_side)[0]
 
     def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, 4, 4] mm, exact -> [C, P]
         """Root of the mean square distance of the points of each image to each view."""
-        return self._measured(poses, probe, POINTS_PER_SIDE)[2]
+        return self._measured(poses, probe, POINTS_PER_SIDE)[1]
 
     def interpolation_mm(self, points: FloatArray) -> FloatArray:  # [K, 3] mm -> [K]
         """As `ViewMeasures` has it, of any points of the scene's frame."""
-        distances = np.empty((3, len(points)), np.float32)
-        _cpu.measure_views(
-            points=np.ascontiguousarray(points, np.float32),
-            **self._images,
-            angles=np.zeros(len(self._rotations), np.float32),
-            facing=np.ones(len(self._rotations), np.float32),
-            measures=distances.reshape(-1),
-            nearest=np.empty(len(points), np.int64),
-            around=np.empty(len(self._rotations), np.float32),
-        )
-        _, before, behind = distances.astype(np.float64)
-        return np.minimum(before * behind / np.maximum(before + behind, 1e-9), FAR_MM)
+        found = np.empty(len(points))
+        self._views.interpolation_mm(np.ascontiguousarray(points, np.float32), found)
+        return found
 
     def _measured(
         self, poses: FloatArray, probe: Probe, points_per_side: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:  # [3, C, K] mm, [C, K] degrees, [C, P] mm
-        """Of the points of each image: distances to the nearest view, to the nearest on either side, the angle to the
-        nearest; and the root of the mean square distance to each view. In float32, by a kernel.
-        """
-        points, rotations = _image_points(probe, points_per_side), poses[:, :3, :3]
-        distances = np.empty((3, len(poses), len(points)), np.float32)
-        around = np.empty((len(poses), len(self._rotations)), np.float32)
-        angles = np.empty((len(poses), len(points)))
-        measures, nearest = np.empty(3 * len(points), np.float32), np.empty(len(points), np.int64)
-        cosines = 0.5 * (rotations.reshape(-1, 9) @ self._rotations.T - 1.0)  # [C, P']
-        turned = np.degrees(np.arccos(np.minimum(np.maximum(cosines, -1.0), 1.0))).astype(np.float32)
-        facing = (rotations[:, :, 1] @ self._elevations).astype(np.float32)  # below 0: front and back swap
-        seen = (points @ rotations.transpose(0, 2, 1) + poses[:, None, :3, 3]).astype(np.float32)  # [C, K, 3] mm
-        for place in range(len(poses)):
-            _cpu.measure_views(
-                points=seen[place],
-                **self._images,
-                angles=turned[place],
-                facing=facing[place],
-                measures=measures,
-                nearest=nearest,
-                around=around[place],
-            )
-            distances[:, place] = measures.reshape(3, -1)
-            angles[place] = turned[place, nearest]
-        return distances.astype(np.float64), angles, around[:, : self._count].astype(np.float64)
+    ) -> tuple[ViewMeasures, FloatArray]:  # the latter [C, P] mm
+        points = _image_points(probe, points_per_side)
+        of_points = np.empty((4, len(poses), len(points)))
+        weights, around_mm = np.empty((2, len(poses), self._count))
+        self._views.measure(np.ascontiguousarray(poses), points, *of_points, weights, around_mm)
+        return ViewMeasures(*of_points, weights), around_mm
 
 
 @lru_cache(maxsize=64)
 def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, probe frame
     origins, directions = probe.scan_lines(per_side)
     points = origins + probe.depths_mm(per_side)[:, None, None] * directions
-    return points.reshape(-1, 3)
+    return np.ascontiguousarray(points.reshape(-1, 3))
 
 
 # The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
@@ -254,9 +206,6 @@ class Support:
         if min(numbers) <= 0.0:
             raise InvalidArgument(f"support must be positive numbers, got {list(numbers)}", field="support")
 
-    def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
-        return self.share * within(measures.distance_mm, self.reach_mm)
-
 
 @dataclass(frozen=True)
 class ConfidenceModel:
@@ -290,23 +239,20 @@ class ConfidenceModel:
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
 
-    def predict(self, measures: ViewMeasures) -> FloatArray:  # [C]
+    def predict(self, measures: ViewMeasures) -> list[float]:  # [C]
         """The MS-SSIM expected at each pose, in [0, 1]."""
-        weights, hardness = self._arrays
-        expected = predicted(weights, terms_of(measures, hardness, self.fitted_to_mm), self.black_ms_ssim)
-        return expected if self.support is None else self.limited(expected, self.support.expected_shares(measures))
+        return self._formula.predict(
+            measures.distance_mm, measures.interpolation_mm, measures.angle_deg, measures.weights
+        )
+
+    def limited(self, confidence: float, supported_share: float) -> float:
+        """The confidence in a frame, limited by the share of its pixels that has support."""
+        return self._formula.limited(confidence, supported_share)
 
     @cached_property
-    def _arrays(self) -> tuple[FloatArray, FloatArray]:
-        return np.array(self.weights), np.array(self.hardness)
-
-    def limited(self, confidences: FloatArray, supported_shares: FloatArray) -> FloatArray:  # [C] both
-        """The confidences of poses, limited by the share of their pixels that has support."""
-        if self.support is None:
-            return confidences
-        shares = np.minimum(1.0, self.support.gain * supported_shares)
-        most: FloatArray = self.black_ms_ssim + (1.0 - self.black_ms_ssim) * shares
-        return np.minimum(confidences, most)
+    def _formula(self) -> _cpu.ConfidenceFormula:
+        support = None if self.support is None else astuple(self.support)
+        return _cpu.ConfidenceFormula(self.weights, self.black_ms_ssim, self.hardness, support, self.fitted_to_mm)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -451,22 +397,22 @@ class Assessor:
             return unknown if coverage is None else self.with_support(unknown, shares)
         measures = self._views.measure(checked, self._info.probe_or(probe))
         trust = self._info.motion.trust(phase) if phase else 1.0
-        confidences = [None] * len(checked)
+        confidences: Sequence[float | None] = [None] * len(checked)
         if self._model is not None:
-            confidences = (trust * self._model.predict(measures)).tolist()
+            confidences = [trust * one for one in self._model.predict(measures)]
         away = (measures.nearest_mm.mean(axis=1).tolist(), measures.angle_deg.mean(axis=1).tolist())
         found = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
         return found if coverage is None else self.with_support(found, shares)
 
     def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
         """The extrapolations of rendered frames, completed with the share of each one's pixels that has support."""
-        confidences = [one.confidence for one in extrapolations]
-        if self._model is not None and None not in confidences:
-            confidences = self._model.limited(np.array(confidences), np.array(shares)).tolist()
-        return [
-            replace(one, confidence=confidence, supported_share=share)
-            for one, confidence, share in zip(extrapolations, confidences, shares, strict=True)
-        ]
+        found = []
+        for one, share in zip(extrapolations, shares, strict=True):
+            confidence = one.confidence
+            if self._model is not None and confidence is not None:
+                confidence = self._model.limited(confidence, share)
+            found.append(replace(one, confidence=confidence, supported_share=share))
+        return found
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

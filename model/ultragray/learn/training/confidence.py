@@ -39,7 +39,6 @@ from ultragray.scene.confidence import (
     FAR_MM,
     NEAR_MM,
     POINTS_PER_SIDE,
-    SMALLEST_MM,
     TERMS,
     ConfidenceModel,
     DepthBands,
@@ -200,7 +199,7 @@ def hardness_of_views(sweep: Sweep, predictions: Sequence[Prediction]) -> FloatA
     shares = np.where([one.is_nearest for one in predictions], np.square(distances_mm), 0.0)
     sums, totals = (np.bincount(rows, values, len(targets)) for values in (shares * misses, shares))
     weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
-    return weights @ sums / np.maximum(weights @ totals, SMALLEST_MM)
+    return weights @ sums / np.maximum(weights @ totals, 1e-6)
 
 
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
