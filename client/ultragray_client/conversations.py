@@ -20,7 +20,7 @@ from ultragray_client.contract import DatasetOptions, RecordingView
 from ultragray_client.errors import ClientError, InvalidArgument, TooManyPoses, Unreachable
 from ultragray_client.frames import Frame, RealFrame, frame_from_message
 from ultragray_client.geometry import PoseLike, pose_messages
-from ultragray_client.messages import message_of
+from ultragray_client.messages import ReceivedFrame, message_of
 from ultragray_client.records import Job, JobEvent, job_from_message
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, recordings_pb2, rendering_pb2
@@ -69,7 +69,7 @@ class Batch(Conversation[Frame]):
         poses = islice(self._waiting, self._per_call)
         return rendering_pb2.RenderBatchRequest(settings=self._settings, poses=poses)
 
-    def take(self, message: rendering_pb2.Frame) -> Frame:
+    def take(self, message: ReceivedFrame) -> Frame:
         """The frame of the first pose that waits."""
         frame = frame_from_message(message, sequence=self._first)
         self._waiting.popleft()

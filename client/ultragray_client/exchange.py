@@ -27,6 +27,7 @@ from ultragray_client.contract import MAX_AHEAD_MS
 from ultragray_client.errors import ClientError, Draining, InvalidArgument
 from ultragray_client.frames import Frame, frame_from_message, image_fields
 from ultragray_client.geometry import PoseLike, pose_message
+from ultragray_client.messages import ReceivedFrame
 from ultragray_proto.v1 import rendering_pb2
 
 SLOTS = 16
@@ -130,8 +131,13 @@ class StreamMode(str, Enum):
 class Answer:
     """A message of the service, and the memory that its pixels may lie in: each connection has its own."""
 
-    message: rendering_pb2.Frame
+    received: ReceivedFrame
     memory: SharedMemory | None
+
+    @property
+    def message(self) -> rendering_pb2.Frame:
+        """Without what it begins with."""
+        return self.received.message
 
     def skip(self) -> None:
         """Nobody wants the frame."""
@@ -251,10 +257,10 @@ class PoseExchange:
             message.clock.CopyFrom(rendering_pb2.ClockStamps(**stamps))
         return message
 
-    def arrived(self, message: rendering_pb2.Frame) -> Answer:
+    def arrived(self, received: ReceivedFrame) -> Answer:
         """A message that came over the connection that was opened last."""
-        self._newest_ns = message.sent_ns, time.monotonic_ns()
-        return Answer(message, self._memory)
+        self._newest_ns = received.message.sent_ns, time.monotonic_ns()
+        return Answer(received, self._memory)
 
     def frame(self, answer: Answer, dropped_here: int = 0) -> Frame:
         """The frame of an answer, with what was dropped since the one before.
@@ -267,7 +273,7 @@ class PoseExchange:
             raise error_of_frame(message.error, message.sequence)
         dropped, self._dropped = self._dropped, 0
         data = None if answer.memory is None else answer.memory.taken(message)
-        frame = frame_from_message(message, sequence=message.sequence, dropped=dropped, data=data)
+        frame = frame_from_message(answer.received, sequence=message.sequence, dropped=dropped, data=data)
         if frame.latency_ms is not None:
             self._latencies_ms.append(frame.latency_ms)
         return frame

@@ -25,7 +25,7 @@ from ultragray_client.contract import (
 )
 from ultragray_client.errors import InvalidArgument
 from ultragray_client.geometry import FloatArray, PoseLike, pose_message
-from ultragray_client.messages import LargeFrame, message_of
+from ultragray_client.messages import FrameHeads, ReceivedFrame, message_of
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import recordings_pb2, rendering_pb2
 
@@ -35,7 +35,6 @@ _PIXEL_TYPES: dict[str, np.dtype[Any]] = {
     Encoding.FLOAT16: np.dtype("<f2"),
 }
 _ENCODINGS = words(rendering_pb2.Encoding.DESCRIPTOR)
-_OUTPUTS = words(rendering_pb2.Output.DESCRIPTOR)
 
 
 @dataclass(frozen=True)
@@ -48,14 +47,20 @@ class Timings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame(SettingsUsed):
+class FrameOrigin(SettingsUsed):
+    """What all frames of a stream have in common."""
+
+    scene: str
+    scene_sha256: str  # of the scene file
+    renderer: str  # name, version and backend
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame(FrameOrigin):
     """A frame, and all that is needed to render it again. `frame["bmode"]` is one of its arrays."""
 
     arrays: Mapping[str, npt.NDArray[Any]]  # by output, each [H, W], read-only: uint8 of 0 to 255, or floats of 0 to 1
     pose: FloatArray  # [4, 4] mm, as used
-    scene: str
-    scene_sha256: str  # of the scene file
-    renderer: str  # name, version and backend
     sequence: int  # in a batch from 0; in a stream that of its pose, from 1
     timings: Timings
     extrapolation: Extrapolation
@@ -140,26 +145,34 @@ def settings_message(scene: str, settings: RenderSettings | None) -> rendering_p
     return message_of(settings, rendering_pb2.RenderSettings, scene=scene)
 
 
-def frame_from_message(
-    message: rendering_pb2.Frame | LargeFrame, *, sequence: int = 0, dropped: int = 0, data: Any = None
-) -> Frame:
+_HEADS = FrameHeads(FrameOrigin)
+
+
+def received_frame(raw: bytes) -> ReceivedFrame:
+    """The frame of its bytes. Raises google.protobuf.message.DecodeError."""
+    return _HEADS.read(raw)
+
+
+def frame_from_message(received: ReceivedFrame, *, sequence: int = 0, dropped: int = 0, data: Any = None) -> Frame:
     """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own."""
-    dtype = _PIXEL_TYPES[_ENCODINGS[message.encoding]]
-    pixels = np.frombuffer(message.data if data is None else data, dtype)
+    message, same = received.message, received.same
+    if not same:
+        same = vars(from_message(message, FrameOrigin))
+    pixels = np.frombuffer(received.data if data is None else data, _PIXEL_TYPES[same["encoding"]])
     pixels.setflags(write=False)
-    pixels = pixels.reshape(-1, message.height, message.width)
-    names = [_OUTPUTS[number] for number in message.outputs]
-    sent_ns = message.client_time_ns if message.HasField("client_time_ns") else None
+    pixels = pixels.reshape(-1, same["height"], same["width"])
+    has = message.HasField
     return from_message(
         message,
         Frame,
-        arrays=MappingProxyType(dict(zip(names, pixels, strict=True))),
+        **same,
+        arrays=MappingProxyType(dict(zip(same["outputs"], pixels, strict=True))),
         sequence=sequence,
         dropped=dropped,
-        latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
-        prediction=from_message(message.prediction, Prediction) if message.HasField("prediction") else None,
-        preview=from_message(message.preview, Preview) if message.HasField("preview") else None,
-        clock=from_message(message.clock, ClockOffset) if message.HasField("clock") else None,
+        latency_ms=(time.monotonic_ns() - message.client_time_ns) / 1e6 if has("client_time_ns") else None,
+        prediction=from_message(message.prediction, Prediction) if has("prediction") else None,
+        preview=from_message(message.preview, Preview) if has("preview") else None,
+        clock=from_message(message.clock, ClockOffset) if has("clock") else None,
     )
 
 

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 from ultragray_client.errors import StreamEnded
-from ultragray_proto.v1 import rendering_pb2
+from ultragray_client.frames import received_frame
 
 _LENGTH = struct.Struct("<I")
 
@@ -47,7 +47,7 @@ class LocalCall:
                 if (length := self._received.read(_LENGTH.size)) and len(length) == _LENGTH.size:
                     size = _LENGTH.unpack(length)[0]
                     if len(data := self._received.read(size)) == size:
-                        return rendering_pb2.Frame.FromString(data)
+                        return received_frame(data)
             self._close()
         return next(self._call)
 
@@ -129,7 +129,7 @@ class AsyncLocalCall:
         if self._streams is not None:
             with suppress(asyncio.IncompleteReadError, OSError):
                 length = await self._streams[0].readexactly(_LENGTH.size)
-                return rendering_pb2.Frame.FromString(await self._streams[0].readexactly(*_LENGTH.unpack(length)))
+                return received_frame(await self._streams[0].readexactly(*_LENGTH.unpack(length)))
             self._streams[1].close()
         return await self._call.read()
 

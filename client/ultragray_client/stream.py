@@ -30,6 +30,7 @@ from ultragray_client.exchange import (
 from ultragray_client.frames import Frame
 from ultragray_client.geometry import PoseLike
 from ultragray_client.local import AsyncLocalCall, LocalCall
+from ultragray_client.messages import ReceivedFrame
 
 Start = Callable[..., Any]  # a call of RenderStream
 
@@ -73,14 +74,14 @@ class _PoseStream:
         else:
             self._is_resumed = True
 
-    def _accepted(self, message: Any) -> Answer | None:
+    def _accepted(self, received: ReceivedFrame) -> Answer | None:
         """The answer that a message is; None: of a service that stops, and refused the pose."""
-        if not self._unanswered.answered(message):
+        if not self._unanswered.answered(received.message):
             return None
         self._retries.progress()
         self._reconnections += self._is_resumed
         self._is_resumed = False
-        return self._exchange.arrived(message)
+        return self._exchange.arrived(received)
 
     def _frame(self, answer: Answer | None) -> Frame:
         """The frame of an answer; raises the error in its place, and StreamEnded where there is no answer."""

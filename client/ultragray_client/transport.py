@@ -26,7 +26,8 @@ from ultragray_client.connection import CHANNEL_OPTIONS, ApiKey, Metadata, Retri
 from ultragray_client.conversations import Conversation
 from ultragray_client.errors import ClientError, NotFound
 from ultragray_client.exchange import PoseExchange
-from ultragray_client.messages import message_of, received_frame
+from ultragray_client.frames import received_frame
+from ultragray_client.messages import message_of
 from ultragray_client.stream import AsyncFrameStream, FrameStream
 from ultragray_proto.codec import from_message
 

@@ -102,18 +102,18 @@ def _at(path: str, convert: _Convert, value: Any) -> Any:
 
 
 def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    is_mapping = isinstance(value, Mapping)
-    found = dict(others or {})
-    cls: Any = None if is_mapping else type(value)
-    steps, oneofs = _writers(descriptor, cls)
+    found = dict(others) if others else {}
+    is_mapping, steps, oneofs = _writers(descriptor, type(value))
     for name, convert, default in steps:
         one = value.get(name) if is_mapping else getattr(value, name, None)
         if one is None or name in found or (default is not None and one == default):
             continue
-        try:
-            found[name] = convert(one)
-        except MessageInvalid as error:
-            raise error.under(name) from error.original
+        if convert is not None:
+            try:
+                one = convert(one)
+            except MessageInvalid as error:
+                raise error.under(name) from error.original
+        found[name] = one
     for name, kinds in oneofs:
         one = value.get(name) if is_mapping else getattr(value, name, None)
         if one is not None and kinds.keys().isdisjoint(found):
@@ -122,11 +122,11 @@ def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | Non
 
 
 @cache
-def _writers(descriptor: Descriptor, cls: type | None) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """What is written of a class (None: of a mapping).
+def _writers(descriptor: Descriptor, cls: type) -> tuple[bool, tuple[Any, ...], tuple[Any, ...]]:
+    """What is written of a class, and whether it is a mapping.
 
-    Each field that it may have, how its value is written, and the default that leaves a message out, None where there
-    is none; then the oneofs.
+    Each field that it may have, how its value is written (None: as it is), and the default that leaves a message out,
+    None where there is none; then the oneofs.
     """
     found = []
     for field in descriptor.fields:
@@ -135,25 +135,29 @@ def _writers(descriptor: Descriptor, cls: type | None) -> tuple[tuple[Any, ...],
         convert = dict if _is_map(field) else _value_writer(field)
         is_message = field.message_type is not None and not field.is_repeated
         if field.is_repeated and not _is_map(field):
-            convert = partial(_list_of, convert)
+            convert = list if convert is None else partial(_list_of, convert)
         found.append((field.name, convert, getattr(cls, field.name, None) if is_message else None))
-    return tuple(found), tuple(one for one in _oneofs(descriptor).items() if _may_have(cls, one[0]))
+    oneofs = tuple(one for one in _oneofs(descriptor).items() if _may_have(cls, one[0]))
+    return issubclass(cls, Mapping), tuple(found), oneofs
 
 
-def _may_have(cls: type | None, name: str) -> bool:
+def _may_have(cls: type, name: str) -> bool:
     """Whether values of a class may have an attribute; of one that is no dataclass, nobody knows."""
-    return cls is None or not is_dataclass(cls) or name in cls.__dataclass_fields__ or hasattr(cls, name)
+    return not is_dataclass(cls) or name in cls.__dataclass_fields__ or hasattr(cls, name)
 
 
 def _list_of(convert: _Convert, values: Iterable[Any]) -> list[Any]:
     return [convert(value) for value in values]
 
 
-def _value_writer(field: FieldDescriptor) -> _Convert:
+def _value_writer(field: FieldDescriptor) -> _Convert | None:
+    """How one value of a field is written; None: as it is."""
     descriptor = field.message_type
     if field.enum_type is not None:
         return partial(_number_of_word, {word: number for number, word in words(field.enum_type).items()})
     if descriptor is None:
+        if field.type != FieldDescriptor.TYPE_STRING:
+            return None
         return lambda value: value.value if isinstance(value, Enum) else value
     if descriptor.full_name == _STRUCT:
         return _struct_of

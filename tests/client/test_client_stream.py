@@ -18,7 +18,7 @@ import pytest
 from ultragray_client import AsyncClient, RenderSettings, errors
 from ultragray_client import exchange as shared_memory
 from ultragray_client.exchange import MAX_WAITING, SLOTS, PoseExchange, SharedMemory
-from ultragray_client.frames import settings_message
+from ultragray_client.frames import received_frame, settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..service.conftest import ROOT
@@ -134,9 +134,13 @@ def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(make_client
 
 def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
     exchange = PoseExchange(settings_message("demo", None), "latest")
+
+    def arriving(message):
+        return exchange.arrived(received_frame(message.SerializeToString()))
+
     error = scenes_pb2.Error(reason="DEADLINE_EXCEEDED", detail="late")
     with pytest.raises(errors.DeadlineExceeded):
-        exchange.frame(exchange.arrived(rendering_pb2.Frame(sequence=3, error=error, dropped=2)))
+        exchange.frame(arriving(rendering_pb2.Frame(sequence=3, error=error, dropped=2)))
     answer = rendering_pb2.Frame(
         sequence=5,
         outputs=[rendering_pb2.OUTPUT_BMODE],
@@ -151,8 +155,8 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
         picture=rendering_pb2.Picture(),
         dropped=1,
     )
-    assert exchange.frame(exchange.arrived(answer), dropped_here=4).dropped == 7
-    assert exchange.frame(exchange.arrived(answer)).dropped == 1
+    assert exchange.frame(arriving(answer), dropped_here=4).dropped == 7
+    assert exchange.frame(arriving(answer)).dropped == 1
 
 
 def test_a_latest_stream_may_be_read_before_anything_is_sent(client):

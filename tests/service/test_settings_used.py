@@ -20,7 +20,7 @@ from ultragray.rendering.display import Display
 from ultragray.rendering.settings import Additions, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.tools import Needle
 from ultragray.scene.confidence import Extrapolation
-from ultragray_client.frames import frame_from_message, origin_of
+from ultragray_client.frames import frame_from_message, origin_of, received_frame
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.http.routes.rendering import render_headers
@@ -96,8 +96,7 @@ def websocket(settings):
 
 
 def grpc(settings):
-    message = rendering_pb2.Frame.FromString(serialized_frame(result(settings), 1))
-    return origin_of(frame_from_message(message))
+    return origin_of(frame_from_message(received_frame(serialized_frame(result(settings), 1))))
 
 
 def igtl(settings):

@@ -65,9 +65,11 @@ class SupportWatch:
         self._shares.extend(share for some in self._noted for share in some.tolist())
         self._noted.clear()
         found = self._assessor.with_support(self._extrapolations[first:stop], self._shares[first:stop])
+        if not (self._contacts and self._contacts[0]):
+            return found
         judged = {
             name: np.concatenate([one[name] for one in self._contacts])[first:stop].tolist()
-            for name in (self._contacts[0] if self._contacts else ())
+            for name in self._contacts[0]
         }
         return [replace(one, **{name: judged[name][at] for name in judged}) for at, one in enumerate(found)]
 

@@ -277,6 +277,14 @@ class Resolved(Additions):
     display: Display = AS_RENDERED
     breathing: Breathing | None = None  # that is to choose the phase of each frame
 
+    def __hash__(self) -> int:
+        """Worked out once: each frame of a stream is asked for by it."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash(tuple(getattr(self, one.name) for one in fields(self)))
+
     def breathed(self, motion: Motion | None) -> Resolved:
         """With the phase of this moment, where tissue breathes by the clock: what is told of the frame."""
         if self.breathing is None or motion is None:

@@ -66,6 +66,15 @@ class _Kept(NamedTuple):
     intensity: str
     made: Any
 
+    def is_of(self, tensors: tuple[Tensor, ...], intensity: str) -> bool:
+        """Whether it was made of these, as they are now."""
+        if len(self.tensors) != len(tensors) or self.intensity != intensity:
+            return False
+        for kept, version, tensor in zip(self.tensors, self.versions, tensors, strict=True):
+            if kept is not tensor or tensor._version != version:
+                return False
+        return True
+
 
 @dataclass(eq=False)
 class GaussianScene:
@@ -197,16 +206,11 @@ class GaussianScene:
         A change that torch does not count (through `.data`) is not noticed.
         """
         tensors = (*self.splats.values(), *(() if self.labels is None else (self.labels,)))
-        if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
-            return make()
-        versions = tuple(tensor._version for tensor in tensors)
         kept = self._prepared.get(name)
-        if (
-            kept is None
-            or kept.versions != versions
-            or kept.intensity != self.info.intensity
-            or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
-        ):
+        if kept is None or not kept.is_of(tensors, self.info.intensity):
+            if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
+                return make()
+            versions = tuple(tensor._version for tensor in tensors)
             kept = _Kept(tensors, versions, self.info.intensity, make())
             self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
         made: Prepared = kept.made

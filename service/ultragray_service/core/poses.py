@@ -148,11 +148,6 @@ class FrameFacts:
             **others,
         )
 
-    @property
-    def timings(self) -> FrameFacts:
-        """Itself: gRPC has the three times in a message of their own."""
-        return self
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameHeader(SettingsUsed, FrameFacts):

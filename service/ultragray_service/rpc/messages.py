@@ -18,7 +18,7 @@ from ultragray.rendering.settings import RenderSettings, Resolved, settings_used
 from ultragray.rendering.volumes import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
-from ultragray_service.core.poses import FrameFacts, SliceFacts, exact_pose
+from ultragray_service.core.poses import SliceFacts, exact_pose
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult
@@ -101,15 +101,22 @@ def serialized_frame(result: RenderResult, sequence: int, **others: Any) -> byte
     """
     if (place := result.place) is not None:
         others["shared_data"] = rendering_pb2.SharedData(slot=place.slot, bytes=place.size)
-    facts = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, **others)
-    pieces = (_settings_bytes(result.settings), facts.SerializeToString(), _data_key(len(result.data)), result.data)
-    return b"".join(pieces)
+    facts = rendering_pb2.Frame(
+        sequence=sequence,
+        pose=geometry_pb2.Matrix(values=result.poses[0].ravel().tolist()),
+        timings=to_message(result, rendering_pb2.Timings),
+        extrapolation=to_message(result.extrapolations[0], rendering_pb2.Extrapolation),
+        **others,
+    )
+    same = _same_bytes(result.settings, result.scene, result.scene_sha256, result.renderer)
+    return b"".join((same, facts.SerializeToString(), _data_key(len(result.data)), result.data))
 
 
 @lru_cache(maxsize=256)
-def _settings_bytes(settings: Resolved) -> bytes:
-    """The part of a frame that is the same for all frames of a stream."""
-    return bytes(to_message(settings_used(settings), rendering_pb2.Frame).SerializeToString())
+def _same_bytes(settings: Resolved, scene: str, scene_sha256: str, renderer: str) -> bytes:
+    """The part of a frame that is the same for all frames of a stream: first, so that clients read it once."""
+    used, origin = settings_used(settings), {"scene": scene, "scene_sha256": scene_sha256, "renderer": renderer}
+    return bytes(to_message(used, rendering_pb2.Frame, **origin).SerializeToString())
 
 
 @lru_cache(maxsize=256)

@@ -179,10 +179,11 @@ class _Socket:
     def __init__(self, end: socket.socket) -> None:
         self._is_over = False  # no more messages are read
         self._opening = asyncio.ensure_future(asyncio.open_unix_connection(sock=end))
+        self._ends: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None  # once it is open
 
     async def read(self) -> Any:  # rendering_pb2.RenderStreamRequest | grpc.aio.EOF
         """Raises InvalidArgument for what is no message, and for one that is too large, which ends the messages."""
-        reader, _ = await asyncio.shield(self._opening)
+        reader, _ = self._ends or await self._opened()
         if self._is_over:
             return grpc.aio.EOF
         try:
@@ -197,11 +198,17 @@ class _Socket:
             raise InvalidArgument("the bytes are not a message of the type that the method takes") from None
 
     async def write(self, message: rendering_pb2.Frame | bytes) -> None:
-        _, writer = await asyncio.shield(self._opening)
+        _, writer = self._ends or await self._opened()
         data = message if isinstance(message, bytes) else message.SerializeToString()
-        with suppress(OSError):  # the client is gone, which ends its call, too
+        try:
             writer.write(_LENGTH.pack(len(data)) + data)
             await writer.drain()
+        except OSError:  # the client is gone, which ends its call, too
+            return
+
+    async def _opened(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        self._ends = await asyncio.shield(self._opening)
+        return self._ends
 
     async def close(self, *, at_once: bool) -> None:
         """Ends the messages, unless `at_once` when those that were written are with the client."""

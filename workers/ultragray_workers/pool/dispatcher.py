@@ -85,7 +85,7 @@ class Assignment:
     def deadline(self) -> float | None:
         """The latest of its steps', in time.monotonic() seconds; None where one has none."""
         deadlines = [step.ticket.request.deadline for step in self.steps.values()]
-        return max((d for d in deadlines if d is not None), default=None) if None not in deadlines else None
+        return max(deadlines, default=None) if None not in deadlines else None  # type: ignore[type-var]
 
 
 class Slot:
@@ -414,7 +414,7 @@ class Dispatcher:
         ticket.rendered_poses += step.frames
         if ticket.rendered_poses < len(ticket.request.poses):
             return
-        if len({rendered.scene_sha256 for rendered in ticket.rendered}) > 1:
+        if any(rendered.scene_sha256 != outcome.scene_sha256 for rendered in ticket.rendered):
             self._fail_ticket(ticket, SceneChangedError())
         elif _is_archive(ticket):
             self._waiting.put_first(Part(ticket, 0, 0))
@@ -444,6 +444,8 @@ def _failure(attempts: int, kills: int) -> RenderFailed | None:
 
 def _summary(steps: list[Rendered]) -> Rendered:
     """The steps of one request as one; the last step knows the size of the reply."""
+    if len(steps) == 1:
+        return steps[0]
     return Rendered(
         size=steps[-1].size,
         scene_sha256=steps[-1].scene_sha256,

@@ -18,6 +18,7 @@ from ultragray_workers.pool.messages import Place, Priority, Rendered, RenderReq
 from ultragray_workers.pool.turns import Forecast, Turns
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
+_PRIORITIES = tuple(Priority)
 _ATTEMPTS_IN_COMPANY = 2
 _BATCH_PRIORITY_SHARE = 4  # an interactive request may have to wait for a part of a batch: a smaller one
 _BATCH_PATIENCE_S = 1.0
@@ -57,8 +58,9 @@ class Ticket:
     @property
     def give_up_at(self) -> float:
         """time.monotonic() from which on it is given up, s: its deadline, or sooner while none of it has begun."""
-        begin_by = self.request.begin_by if self.memory is None else None
-        return min((at for at in (self.request.deadline, begin_by) if at is not None), default=math.inf)
+        request = self.request
+        deadline = math.inf if request.deadline is None else request.deadline
+        return deadline if request.begin_by is None or self.memory is not None else min(deadline, request.begin_by)
 
     @property
     def expired(self) -> bool:
@@ -186,11 +188,9 @@ class WaitingQueue:
 
     def take_batch(self) -> list[Part]:
         """The steps to be done next, together; empty when nothing waits. Drops tickets past their deadline."""
-        priorities = list(Priority)
         patient_s = time.monotonic() - self._last_batch_turn
-        if patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH:
-            priorities.reverse()
-        for priority in priorities:
+        is_batch_due = patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH
+        for priority in reversed(_PRIORITIES) if is_batch_due else _PRIORITIES:
             while (ticket := next(iter(self._again[priority]), self._turns[priority].first())) is not None:
                 if ticket.expired:
                     self.expire(ticket)

@@ -199,7 +199,9 @@ class _Worker:
     def _render_parts(self, task: Task[Resolved], memories: Sequence[int]) -> Iterator[Outcome]:
         """Frames: all parts are rendered together, where that fails each alone, as it may be one that fails."""
         first = task.parts[0]
-        poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
+        poses = (
+            first.poses if len(task.parts) == 1 else np.concatenate([part.poses for part in task.parts])
+        )  # [C, 4, 4]
         wanted: dict[str, set[np.dtype[Any]]] = {}
         for part in task.parts:
             for name in part.settings.outputs:
@@ -259,7 +261,7 @@ class _Worker:
                 some,
                 outputs=outputs,
                 backend=self._backend,
-                limits=limits.after(done - len(some)),
+                limits=limits if done == len(some) else limits.after(done - len(some)),
                 support=support,
                 in_bytes=in_bytes,
             )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -139,15 +139,8 @@ def _draw(
 ) -> None:
     """Has the kernel fill planes [C, H, W], and what `more` asks for. Raises FrameTooCostly, GivenUp."""
     bounds = {"footprint_pixels": limits.footprint_pixels, "flag": limits.flag, "number": limits.number}
-    with _limited(limits):
-        _cpu.render(
-            _sorted(scene, weighted),
-            **view,
-            **_arrays(planes),
-            **bounds,
-            displacements=_fields(scene),
-            **more,
-        )
+    arguments = {**view, **_arrays(planes), **bounds, "displacements": _fields(scene), **more}
+    _within(limits, _cpu.render, _sorted(scene, weighted), **arguments)
 
 
 def _fields(scene: GaussianScene) -> list[_Field]:
@@ -162,11 +155,10 @@ def _fields(scene: GaussianScene) -> list[_Field]:
     ]
 
 
-@contextmanager
-def _limited(limits: Limits) -> Iterator[None]:
-    """The kernel's errors at a limit as ours."""
+def _within(limits: Limits, kernel: Callable[..., None], scene: _cpu.PreparedScene, **arguments: Any) -> None:
+    """Calls a kernel, whose errors at a limit become ours."""
     try:
-        yield
+        kernel(scene, **arguments)
     except _cpu.GivenUp:
         raise GivenUp from None
     except _cpu.TooCostly as error:
@@ -187,16 +179,17 @@ def footprint_pixels(
     """The cost of each pose (`ultragray.rendering.limits`), without drawing it. Raises GivenUp."""
     view = _view_arguments(probe, poses_cm, height, width, beam)
     pixels = np.empty(len(poses_cm), np.int64)
-    with _limited(limits):
-        _cpu.footprints(
-            _sorted(scene),
-            **view,
-            instruction_set=instruction_set,
-            pixels=pixels,
-            flag=limits.flag,
-            number=limits.number,
-            displacements=_fields(scene),
-        )
+    _within(
+        limits,
+        _cpu.footprints,
+        _sorted(scene),
+        **view,
+        instruction_set=instruction_set,
+        pixels=pixels,
+        flag=limits.flag,
+        number=limits.number,
+        displacements=_fields(scene),
+    )
     return pixels.tolist()
 
 
@@ -227,17 +220,24 @@ def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
 
 
 def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int, beam: Tensor | None) -> dict[str, Any]:
+    return {
+        **_image_arguments(probe, height, width),
+        "beam": THIN if beam is None else BeamVariance.of(beam, probe, height),
+        "poses": np.ascontiguousarray(KernelLines.of(probe).view_axes(poses_cm)),
+        "threads": torch.get_num_threads(),
+    }
+
+
+@lru_cache(maxsize=64)  # each frame asks for those of its probe
+def _image_arguments(probe: Probe, height: int, width: int) -> dict[str, Any]:
     lines = KernelLines.of(probe)
     return {
         **{name: getattr(lines, name) for name in ("fanned", "wrap", "start", "span")},
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,
-        "beam": THIN if beam is None else BeamVariance.of(beam, probe, height),
-        "poses": np.ascontiguousarray(lines.view_axes(poses_cm)),
         "height": height,
         "width": width,
-        "threads": torch.get_num_threads(),
     }
 
 

@@ -140,7 +140,7 @@ def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
     if beam is None or (isinstance(beam, ElevationBeam) and beam.thickness_mm == 0.0):
         return None
     if isinstance(beam, ElevationBeam):
-        beam = torch.tensor(beam.numbers, dtype=torch.float64)
+        return _constant_beam_cm(beam, probe)
     if not isinstance(beam, Tensor) or beam.shape != (3,) or not beam.is_floating_point():
         raise InvalidArgument(
             "beam must be an ElevationBeam or a tensor [3] of its thickness, focus and depth of field in mm, got "
@@ -151,6 +151,11 @@ def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
     return torch.stack(
         [thickness / (10.0 * FWHM_PER_SIGMA), (focus + probe.face_depth_mm) / 10.0, depth_of_field / 20.0]
     )
+
+
+@lru_cache(maxsize=64)  # each frame asks for that of its probe
+def _constant_beam_cm(beam: ElevationBeam, probe: Probe) -> Tensor | None:
+    return beam_cm(torch.tensor(beam.numbers, dtype=torch.float64), probe)
 
 
 class Moments(NamedTuple):
