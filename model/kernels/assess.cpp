@@ -44,9 +44,9 @@ TrainingViews::Distances TrainingViews::distances(const float* points, size_t co
     const ViewImages images{edges_, axes_.data(), offsets_.data(), int64_t(views)};
     const ViewLimits limits{float(kSmallestMm), float(1e3 * kFarMm), kMmByDegree};  // 1e3: of a side without a view
     choose_kernels(instruction_set_)
-        .measure_views(points, int(count), angles, facing, images, limits,
-                       {found.nearest.data(), found.before.data(), found.behind.data(), found.place.data(),
-                        found.around.data()});
+        .measure_views(
+            points, int(count), angles, facing, images, limits,
+            {found.nearest.data(), found.before.data(), found.behind.data(), found.place.data(), found.around.data()});
     return found;
 }
 

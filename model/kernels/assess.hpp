@@ -21,7 +21,8 @@ struct ViewMeasures {
 // The images of training views of one probe, in space; one or more.
 class TrainingViews {
  public:
-    TrainingViews(const double* poses, size_t count, const ImageEdges& edges, const std::string& instruction_set);  // [P, 4, 4] mm
+    TrainingViews(const double* poses, size_t count, const ImageEdges& edges,
+                  const std::string& instruction_set);  // [P, 4, 4] mm
     size_t count() const { return count_; }
     // Of a pose [4, 4], mm, and points [K, 3] of the frame of its probe, mm.
     ViewMeasures measure(const double* pose, const double* points, size_t count) const;

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <limits>
 
-
 namespace ultragray::library {
 namespace {
 
@@ -73,7 +72,8 @@ ConfidenceModel ConfidenceModel::read(const Value& value) {
                            support.require(name, [&, into = into](const Value& one) { *into = one.number(positive); });
                        support.end();
                    }));
-    fields.require("fitted_to_mm", unless_null([&](const Value& it) { model.formula.fitted_to_mm = it.number(at_least_0); }));
+    fields.require("fitted_to_mm",
+                   unless_null([&](const Value& it) { model.formula.fitted_to_mm = it.number(at_least_0); }));
     fields.require("uncertainty", unless_null([&](const Value& it) {
                        Fields uncertainty(it, "uncertainty");
                        Uncertainty& of = model.uncertainty.emplace();
@@ -95,8 +95,8 @@ Extrapolation assess(const TrainingViews* views, const ConfidenceModel* model, c
     found.angle_deg = mean_of(measures.angle_deg);
     if (model)
         found.confidence =
-            model->formula.predict(measures.distance_mm.data(), measures.interpolation_mm.data(),
-                                   measures.angle_deg.data(), measures.distance_mm.size(), measures.weights.data());
+            model->formula.predict(measures.distance_mm.data(), measures.interpolation_mm.data(), measures.angle_deg.data(),
+                                   measures.distance_mm.size(), measures.weights.data());
     return found;
 }
 

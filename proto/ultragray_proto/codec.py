@@ -103,7 +103,8 @@ def _at(path: str, convert: _Convert, value: Any) -> Any:
 
 def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
     found = dict(others) if others else {}
-    is_mapping, steps, oneofs = _writers(descriptor, type(value))
+    cls: Any = type(value)
+    is_mapping, steps, oneofs = _writers(descriptor, cls)
     for name, convert, default in steps:
         one = value.get(name) if is_mapping else getattr(value, name, None)
         if one is None or name in found or (default is not None and one == default):

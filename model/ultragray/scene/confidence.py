@@ -81,10 +81,11 @@ class TrainingViews:
         self, poses: FloatArray, probe: Probe, points_per_side: int
     ) -> tuple[ViewMeasures, FloatArray]:  # the latter [C, P] mm
         points = _image_points(probe, points_per_side)
-        of_points = np.empty((4, len(poses), len(points)))
+        nearest_mm, distance_mm, interpolation_mm, angle_deg = np.empty((4, len(poses), len(points)))
         weights, around_mm = np.empty((2, len(poses), self._count))
-        self._views.measure(np.ascontiguousarray(poses), points, *of_points, weights, around_mm)
-        return ViewMeasures(*of_points, weights), around_mm
+        found = ViewMeasures(nearest_mm, distance_mm, interpolation_mm, angle_deg, weights)
+        self._views.measure(np.ascontiguousarray(poses), points, **vars(found), around_mm=around_mm)
+        return found, around_mm
 
 
 @lru_cache(maxsize=64)
