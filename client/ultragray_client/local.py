@@ -19,6 +19,7 @@ from ultragray_client.errors import StreamEnded
 from ultragray_client.frames import received_frame
 
 _LENGTH = struct.Struct("<I")
+_READ_BYTES = 2**16  # at once: many messages
 
 
 class LocalCall:
@@ -27,6 +28,7 @@ class LocalCall:
     def __init__(self, start: Callable[[Iterator[Any]], Any], messages: Iterator[Any], listener: socket.socket) -> None:
         self._listener = listener
         self._socket: socket.socket | None = None
+        self._received = bytearray()  # of messages that are not read yet
         self._is_settled = threading.Event()  # the service has connected, or will not
         self._call = start(iter([next(messages)]))
         if not self._call.add_callback(self._hang_up):
@@ -42,14 +44,37 @@ class LocalCall:
     def __next__(self) -> Any:
         """The next message. After the last one it raises what the call raises then."""
         self._is_settled.wait()
-        if self._socket is not None and not self._received.closed:
+        if self._socket is not None:
             with suppress(OSError):
-                if (length := self._received.read(_LENGTH.size)) and len(length) == _LENGTH.size:
-                    size = _LENGTH.unpack(length)[0]
-                    if len(data := self._received.read(size)) == size:
-                        return received_frame(data)
+                if (data := self._read(self._socket)) is not None:
+                    return received_frame(data)
             self._close()
         return next(self._call)
+
+    def _read(self, end: socket.socket) -> bytes | None:
+        """The bytes of the next message; None after the last one."""
+        held = self._received
+        while True:
+            if len(held) >= _LENGTH.size and len(held) >= (stop := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
+                data = bytes(memoryview(held)[_LENGTH.size : stop])
+                del held[:stop]
+                return data
+            if not (some := end.recv(_READ_BYTES)):
+                return None
+            held += some
+
+    def send_at_once(self, message: Any) -> bool:
+        """Sends a message from the thread of the caller; False where the socket is not open or would have it wait."""
+        if self._socket is None:
+            return False
+        data = message.SerializeToString()
+        data = _LENGTH.pack(len(data)) + data
+        try:
+            sent = self._socket.send(data, socket.MSG_DONTWAIT)
+            self._socket.sendall(data[sent:])
+        except OSError:  # no room, or the call is over: reading tells why
+            return False
+        return True
 
     def cancel(self) -> bool:
         cancelled = bool(self._call.cancel())
@@ -61,7 +86,7 @@ class LocalCall:
         try:
             with self._listener:
                 end, _ = self._listener.accept()
-            self._received, self._socket = end.makefile("rb"), end
+            self._socket = end
             if not self._call.is_active():
                 self._hang_up()
         except OSError:  # the call is over: reading tells why
@@ -78,7 +103,6 @@ class LocalCall:
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)  # wakes whoever reads or writes
-            self._received.close()
             self._socket.close()
 
     def _hang_up(self) -> None:

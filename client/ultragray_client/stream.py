@@ -112,6 +112,7 @@ class FrameStream(_PoseStream):
         self._cancelled = False
         self._real: Any = None  # the newest real frame, likewise
         self._over = False  # no more answers come
+        self._is_sending = False  # the thread of the connection has a message in hand
         self._open()
         if self._is_latest:
             threading.Thread(target=self._take_answers, name="ultragray-stream", daemon=True).start()
@@ -136,9 +137,19 @@ class FrameStream(_PoseStream):
                 self._unanswered.replaced()
                 self._lost += 1
             self._unanswered.sent(message)
-            self._unsent.append(message)
-            self._changed.notify_all()
+            if not self._is_sent_at_once(message):
+                self._unsent.append(message)
+                self._changed.notify_all()
         return int(message.sequence)
+
+    def _is_sent_at_once(self, message: Any) -> bool:
+        """Sends a pose where nothing is to go before it and nobody has to wait: the thread takes longer to wake up."""
+        if self._unsent or self._real or self._is_sending or not isinstance(self._call, LocalCall):
+            return False
+        if not self._call.send_at_once(self._exchange.departing(message, self._taken)):
+            return False
+        self._taken = None
+        return True
 
     def send_real(self, image: npt.ArrayLike | bytes, measured_ns: int) -> None:
         """Sends a frame of the real probe that has come, late: frames are corrected by it, and tell so in `preview`.
@@ -219,6 +230,7 @@ class FrameStream(_PoseStream):
         """What waits for a call, until another call takes its place, or no more poses come."""
         while True:
             with self._changed:
+                self._is_sending = self._is_sending and unsent is not self._unsent
                 while unsent is self._unsent and not (
                     unsent or self._real or self._closed or (self._taken and self._unanswered)
                 ):
@@ -235,6 +247,7 @@ class FrameStream(_PoseStream):
                 taken = None if is_opening else self._take_acknowledgement()
                 if message is None and taken is None:
                     return
+                self._is_sending = True
             yield self._exchange.departing(message, taken)
 
     def _ended(self, call: Any) -> None:
