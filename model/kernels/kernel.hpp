@@ -122,6 +122,7 @@ class SliceList {
     ~SliceList();
     Slice* append(int n);  // room for n more; call shrink_by for those not written
     void shrink_by(int n);
+    void clear();  // gives its memory back
     const Slice* data() const { return data_; }
     int64_t size() const { return size_; }
     int64_t lines = 0;  // scan lines that each slice may touch, added up

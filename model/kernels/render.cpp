@@ -17,6 +17,8 @@ namespace {
 constexpr int64_t kClustersPerTask = 128;
 constexpr float kMmPerCm = 10;
 constexpr int kPosesAtOnce = 8;                    // bounds the memory that slices take
+constexpr int kPosesShared = 64;                   // at once, where each thread draws poses of its own
+constexpr int kPosesOfAThread = 8;                 // at least, so that none waits long for the last one
 constexpr int64_t kPixelsBetweenChecks = 1 << 21;  // of the flag that ends a rendering: at most some 10 ms
 
 std::vector<const Kernels*> available_kernels() {
@@ -194,25 +196,28 @@ class Fields {
     std::vector<std::vector<Layer>> layers_;  // likewise
 };
 
-// One allocation of the four accumulators of a strip.
+// One allocation of the four accumulators of a strip, row by row: a plane each would put the four of a pixel at addresses
+// that differ by a multiple of 4 KB, where a processor takes the loads of one for those that its stores to another feed.
 class StripBuffer {
  public:
-    StripBuffer(int height, int lines) : stride_(lines + kMaxLanes), rows_(height) {
-        floats_ = static_cast<float*>(::operator new(4 * plane() * sizeof(float), std::align_val_t(64)));
+    StripBuffer(int height, int lines) : width_(lines + kMaxLanes), rows_(height) {
+        floats_ = static_cast<float*>(::operator new(int64_t(4) * width_ * rows_ * sizeof(float), std::align_val_t(64)));
     }
     ~StripBuffer() { ::operator delete(floats_, std::align_val_t(64)); }
     StripBuffer(const StripBuffer&) = delete;
     StripBuffer& operator=(const StripBuffer&) = delete;
 
     Strip clear(int first, int lines) {
-        std::fill_n(floats_, 2 * plane(), 0.0f);
-        std::fill_n(floats_ + 2 * plane(), 2 * plane(), 1.0f);
-        return {floats_, floats_ + plane(), floats_ + 2 * plane(), floats_ + 3 * plane(), stride_, first, lines};
+        float* at = floats_;
+        for (int row = 0; row < rows_; ++row, at += 4 * width_) {
+            std::fill_n(at, 2 * width_, 0.0f);
+            std::fill_n(at + 2 * width_, 2 * width_, 1.0f);
+        }
+        return {floats_, floats_ + width_, floats_ + 2 * width_, floats_ + 3 * width_, 4 * width_, first, lines};
     }
 
  private:
-    int64_t plane() const { return int64_t(stride_) * rows_; }
-    int stride_, rows_;
+    int width_, rows_;
     float* floats_;
 };
 
@@ -270,17 +275,30 @@ class Batch {
                 int first = 0, const Lines& drawn = {}) {
         const int first_strip = drawn.first / kStripLines, end = std::min(drawn.end, views_[0].lines);
         const int strips = (end + kStripLines - 1) / kStripLines - first_strip;
+        const auto check = [&](int c) {
+            const auto& most = limits.footprint_pixels;
+            if (sum(c, footprint_bound) <= most) return;
+            const int64_t pixels = sum(c, footprint_pixels);
+            if (pixels > most) throw TooCostly(first + c, pixels);
+        };
+        const auto draw_strip = [&](int task) {
+            const int c = task / strips, line = (first_strip + task % strips) * kStripLines;
+            draw(c, line, outputs, saved.empty() ? SavedPlanes{} : saved[c], limits);
+        };
+        if (saved.empty() && count() >= kPosesOfAThread * threads) {
+            // Slices are drawn by the thread that made them, out of its cache.
+            Phase whole{count(), [&](int c) {
+                            for (int part = 0; part < parts(); ++part) slice(c * parts() + part, limits);
+                            check(c);
+                            for (int strip = 0; strip < strips; ++strip) draw_strip(c * strips + strip);
+                            for (int part = 0; part < parts(); ++part) slices_[int64_t(c) * parts() + part].clear();
+                        }};
+            run_phases({&whole}, threads);
+            return;
+        }
         Phase slicing{count() * parts(), [&](int task) { slice(task, limits); }};
-        Phase checking{count(), [&](int c) {
-                           const auto& most = limits.footprint_pixels;
-                           if (sum(c, footprint_bound) <= most) return;
-                           const int64_t pixels = sum(c, footprint_pixels);
-                           if (pixels > most) throw TooCostly(first + c, pixels);
-                       }};
-        Phase drawing{count() * strips, [&](int task) {
-                          const int c = task / strips, line = (first_strip + task % strips) * kStripLines;
-                          draw(c, line, outputs, saved.empty() ? SavedPlanes{} : saved[c], limits);
-                      }};
+        Phase checking{count(), check};
+        Phase drawing{count() * strips, draw_strip};
         run_phases({&slicing, &checking, &drawing}, threads);
     }
 
@@ -410,7 +428,7 @@ class Planes {
 
 }  // namespace
 
-SliceList::~SliceList() { std::free(data_); }
+SliceList::~SliceList() { clear(); }
 
 Slice* SliceList::append(int n) {
     if (size_ + n > capacity_) {
@@ -425,6 +443,12 @@ Slice* SliceList::append(int n) {
 }
 
 void SliceList::shrink_by(int n) { size_ -= n; }
+
+void SliceList::clear() {
+    std::free(data_);
+    data_ = nullptr;
+    size_ = capacity_ = lines = 0;
+}
 
 const Kernels& choose_kernels(const std::string& name) {
     static const std::vector<const Kernels*> available = available_kernels();
@@ -444,9 +468,9 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
             const Lines& drawn, const Displacements& displacements) {
     const Kernels& kernels = choose_kernels(instruction_set);
     const int64_t frame_size = int64_t(height) * width;
-    for (int first = 0; first < count; first += kPosesAtOnce) {
-        Batch batch(scene, probe, poses, first, std::min(kPosesAtOnce, count - first), height, width, kernels,
-                    displacements);
+    const int at_once = count >= kPosesOfAThread * threads ? kPosesShared : kPosesAtOnce;
+    for (int first = 0; first < count; first += at_once) {
+        Batch batch(scene, probe, poses, first, std::min(at_once, count - first), height, width, kernels, displacements);
         batch.render(outputs.from(first, frame_size), {}, threads, limits, first, drawn);
     }
 }
