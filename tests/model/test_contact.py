@@ -8,8 +8,11 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe, render
 from ultragray.errors import InvalidArgument
+from ultragray.rendering.confidence import supported_shares
 from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch
+from ultragray.rendering.frames import render_grey
 from ultragray.rendering.outputs import PLANES
+from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
@@ -60,6 +63,14 @@ def test_scan_lines_in_the_air_are_dark_and_the_others_as_they_were(scene):
     in_air = judged["attenuation"][1]  # all of the beam ends at the face
     assert (in_air[0] == 1.0).all()
     assert (in_air[1:] == 0.0).all()
+
+
+def test_frames_in_bytes_at_once_are_as_dark_in_the_air(scene):
+    poses = np.stack([at(tilt_deg=15.0), at(z=-5.0), at()])
+    judged = render(scene, None, poses, **SIZE, outputs=("bmode", "coverage"), contact=Contact.AIR)
+    grey = render_grey(scene, None, poses, **SIZE, touch=judged.touch)
+    assert np.array_equal(grey.bmode.numpy(), to_uint8(judged["bmode"].numpy()))
+    assert np.array_equal(grey.supported, supported_shares(judged["coverage"]).numpy())
 
 
 def test_poses_keep_their_order_under_pressure(scene):

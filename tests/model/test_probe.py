@@ -12,7 +12,7 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe,
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidProbe
 from ultragray.exchange.released_config import stretch_released_far
-from ultragray.geometry.scan_conversion import samples, scan_convert
+from ultragray.geometry.scan_conversion import interpolated_frames, samples, scan_convert
 
 PROBES = [
     *(member(**member.example()) for member in Probe.members.values()),
@@ -68,6 +68,14 @@ def test_a_mean_is_culled_by_its_depth(probe: Probe) -> None:
     np.testing.assert_array_equal(probe.cull(points[:, 0], points[:, 2], 10), [True, True, False])
     before = probe.points_mm(np.array([-0.01]), np.array([0.3]))
     assert not probe.cull(before[:, 0], before[:, 2], 10).any()
+
+
+def test_between_pixels_each_place_has_its_frame_and_the_first_column_follows_the_last():
+    frames = np.arange(24.0).reshape(2, 3, 4)
+    which, rows = np.array([0, 1, 1, 0]), np.array([0.5, 1.0, 2.0, 1.0])
+    columns = np.array([1.5, -0.25, 3.25, 0.0])
+    expected = [(1.0 + 2.0 + 5.0 + 6.0) / 4.0, 0.25 * 19.0 + 0.75 * 16.0, 0.75 * 23.0 + 0.25 * 20.0, 4.0]
+    assert interpolated_frames(frames, which, rows, columns).tolist() == expected
 
 
 @each_probe

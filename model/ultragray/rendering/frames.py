@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
@@ -158,6 +159,41 @@ def render(
     return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen}, touch, pressing)
 
 
+class GreyFrames(NamedTuple):
+    """B-mode in 8 bits, as `ultragray.rendering.pixels.to_uint8` rounds it."""
+
+    bmode: Tensor  # [C, H, W] uint8
+    supported: npt.NDArray[np.float32]  # [C]: the share of each frame's pixels with SUPPORT_COVERAGE
+
+
+def render_grey(
+    scene: GaussianScene,
+    probe: Probe | None,
+    poses: Any,  # [C, 4, 4] or [4, 4] mm, probe→scene
+    *,
+    height: int,
+    width: int,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    beam: ElevationBeam | None = None,
+    touch: Touch | None = None,
+) -> GreyFrames | None:
+    """B-mode as `render` has it, in one pass that writes no planes; None where the scene's backend has no such pass.
+
+    Scan lines without contact in `touch` are black; None: contact is assumed. Raises what `render` raises.
+    """
+    draw = BACKENDS[choose_backend(backend, scene)].draw_grey
+    if draw is None:
+        return None
+    known = scene.info.probe_or(probe)
+    shown = beam_cm(scene.info.beam if beam is None else beam, known)
+    grey, shares = draw(scene, known, scene_poses(scene, poses), height, width, SUPPORT_COVERAGE, limits, shown)
+    if touch is not None:
+        pixels = grey.numpy()
+        np.multiply(pixels, touch.lines[:, None], out=pixels)
+    return GreyFrames(grey, shares)
+
+
 def _tools_in_view(tools: Sequence[Tool], view: View, poses: Any, beam: Tensor | None) -> ToolsInView | None:
     """Tools as a view sees them: rigid, where they are, whatever the probe does to the tissue."""
     if not tools:
@@ -229,14 +265,12 @@ def render_shown(
     is_recorded = not scene.info.made_labels
     is_plain = is_recorded and _is_plain(settings) and not (support is not None and support.masks)
     if in_bytes and names == ("bmode",) and is_plain:
-        draw = BACKENDS[choose_backend(backend, scene)].draw_grey
-        if draw is not None:
-            beam = beam_cm(scene.info.beam if settings.beam is None else settings.beam, settings.probe)
-            size = settings.height, settings.width
-            grey, shares = draw(scene, settings.probe, scene_poses(scene, poses), *size, SUPPORT_COVERAGE, limits, beam)
+        size = {"height": settings.height, "width": settings.width}
+        grey = render_grey(scene, settings.probe, poses, **size, backend=backend, limits=limits, beam=settings.beam)
+        if grey is not None:
             if support is not None:
-                support.note(shares)
-            return {"bmode": grey}
+                support.note(grey.supported)
+            return {"bmode": grey.bmode}
     frames = render(
         scene,
         poses=poses,

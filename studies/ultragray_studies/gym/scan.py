@@ -22,11 +22,11 @@ from ultragray.geometry.probe import BoolArray, FloatArray, Probe
 from ultragray.geometry.rotations import about_axes, random_directions, rotation_angles_deg, rotations_of
 from ultragray.rendering.confidence import supported_shares
 from ultragray.rendering.contact import Touch
-from ultragray.rendering.frames import render, touch_of
+from ultragray.rendering.frames import render, render_grey, touch_of
 from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact
 from ultragray.rendering.tools import Tool
-from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, is_confident
+from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, Extrapolation, is_confident
 from ultragray.scene.gaussians import GaussianScene
 
 _ROOM_MM, _ROOM_DEG = 10.0, 10.0  # beyond twice the farthest start
@@ -145,6 +145,11 @@ class Site:
         settings = self.settings
         contact = settings.contact if judged else None
         watched = judged and settings.min_confidence is not None
+        masked = watched and settings.low_confidence is LowConfidence.MASK
+        if contact is not Contact.PRESSURE and not masked and not any(tools):
+            plain = self._plain_look(poses, contact, watched)
+            if plain is not None:
+                return plain
         shown: dict[str, Any] = {
             "height": settings.height,
             "width": settings.width,
@@ -165,18 +170,29 @@ class Site:
                 lines = np.concatenate([frames.touch.lines for frames in each if frames.touch is not None])
             confidences = None
             if watched:
-                confidences = self._judged(poses, bmode, _together([frames["coverage"] for frames in each]))
+                coverage = _together([frames["coverage"] for frames in each])
+                found = self._judged(poses, supported_shares(coverage).tolist())
+                if masked:
+                    least = settings.min_confidence or 0.0
+                    low = torch.tensor([not is_confident(one, least) for one in found], device=bmode.device)
+                    bmode.masked_fill_(low[:, None, None] & (coverage < SUPPORT_COVERAGE), 0.0)
+                confidences = _confidences(found)
         return View(poses, _grey(bmode), lines, confidences)
 
-    def _judged(self, poses: FloatArray, bmode: Tensor, coverage: Tensor) -> FloatArray:  # [K, 4, 4], [K, H, W] -> [K]
-        """The confidence of frames, which are masked in place where settings want it. 0 where it is unknown."""
-        least = self.settings.min_confidence or 0.0
-        shares = supported_shares(coverage).tolist()
-        found = self._assessor.with_support(self._assessor.assess(poses, self.probe), shares)
-        if self.settings.low_confidence is LowConfidence.MASK:
-            masked = torch.tensor([not is_confident(one, least) for one in found], device=bmode.device)
-            bmode.masked_fill_(masked[:, None, None] & (coverage < SUPPORT_COVERAGE), 0.0)
-        return np.array([one.confidence or 0.0 for one in found])
+    def _plain_look(self, poses: FloatArray, contact: Contact | None, watched: bool) -> View | None:  # [K, 4, 4]
+        """Frames into which nothing is put but what air darkens, in one pass; None where the scene has no such pass."""
+        size = self.settings.height, self.settings.width
+        touch = None if contact is None else self.touch(poses)
+        grey = render_grey(self.scene, self.probe, poses, height=size[0], width=size[1], touch=touch)
+        if grey is None:
+            return None
+        lines = np.ones((len(poses), size[1]), np.bool_) if touch is None else touch.lines
+        found = _confidences(self._judged(poses, grey.supported.tolist())) if watched else None
+        return View(poses, grey.bmode, lines, found)
+
+    def _judged(self, poses: FloatArray, shares: list[float]) -> list[Extrapolation]:  # [K, 4, 4], [K] -> [K]
+        """How far frames, of whose pixels such shares have support, are from what the scene was trained on."""
+        return self._assessor.with_support(self._assessor.assess(poses, self.probe), shares)
 
     def random_starts(self, around: FloatArray, randoms: Sequence[np.random.Generator]) -> FloatArray:  # [4, 4]
         """A pose around another for each of K generators, [K, 4, 4]: of all that were drawn, the first with enough
@@ -229,6 +245,11 @@ class Site:
             )
         found: FloatArray = points[scene.labels.cpu().numpy() == numbers[0]]
         return found
+
+
+def _confidences(found: Sequence[Extrapolation]) -> FloatArray:  # [K]
+    """0 where it is unknown."""
+    return np.array([one.confidence or 0.0 for one in found])
 
 
 def _together(parts: Sequence[Tensor]) -> Tensor:

@@ -79,16 +79,17 @@ def _tensor(values: FloatArray, like: Tensor) -> Tensor:
 
 COARSE = 8  # pixels of a side that are averaged
 LEAST_CONTRAST = 1e-5  # of the square of a frame's brightness: what varies less is rounding
+TOGETHER = 16  # frames that are compared at once by the CPU: as many as its cache holds as floats
 
 
 class Target:
     """A frame that others are compared with: quick, and telling from afar."""
 
     def __init__(self, frame: Tensor) -> None:  # [H, W] uint8
-        self._parts = []
-        for rows in _rows_of(frame[None]):
-            centred = rows[0] - rows[0].mean()
-            self._parts.append(centred / centred.norm())
+        means = [_means_of(side) for side in frame.shape]
+        self._means: list[Any] = [one.to(frame.device) if frame.is_cuda else one.numpy() for one in means]
+        centred = [rows[0] - rows[0].mean() for rows in self._rows_of(frame[None])]
+        self._parts = [part / (part @ part) ** 0.5 for part in centred]
 
     def similarity(self, frames: Tensor) -> Tensor:  # [K, H, W] uint8 -> [K]
         """The mean of two correlations, from −1 to 1: of the frames, and of their means over 8x8 pixels.
@@ -96,24 +97,36 @@ class Target:
         The first tells a frame that is the target's from one beside it, the second the way to it from some millimetres
         away. That of a frame without contrast, such as one without contact, is 0.
         """
-        both = zip(_rows_of(frames), self._parts, strict=True)
-        mean: Tensor = torch.stack([_correlations(rows, part) for rows, part in both]).mean(dim=0)
-        return mean
+        some = frames.split(len(frames) if frames.is_cuda else TOGETHER)
+        return torch.cat([torch.as_tensor(self._similarity(few)) for few in some])
+
+    def _similarity(self, frames: Tensor) -> Any:  # [K, H, W] -> [K]
+        fine, coarse = (_correlations(*both) for both in zip(self._rows_of(frames), self._parts, strict=True))
+        return 0.5 * (fine + coarse)
+
+    def _rows_of(self, frames: Tensor) -> tuple[Any, Any]:  # [K, H, W] -> [K, pixels] both
+        """Frames, and their means over squares, pixels in a row: NumPy's, but of a GPU torch's."""
+        # On a busy machine the threads of torch wait for each other several times as long as this takes.
+        grey = frames.float() if frames.is_cuda else frames.numpy().astype(np.float32)
+        along_rows, along_columns = self._means
+        means = along_rows @ (grey @ along_columns.T)
+        return grey.reshape(len(grey), -1), means.reshape(len(grey), -1)
 
 
-def _rows_of(frames: Tensor) -> tuple[Tensor, Tensor]:  # [K, H, W] -> [K, pixels] both
-    """Frames, and their means over squares, pixels in a row."""
-    grey = frames.float()
-    size = max(1, grey.shape[1] // COARSE), max(1, grey.shape[2] // COARSE)
-    return grey.flatten(1), interpolate(grey[:, None], size=size, mode="area").flatten(1)
+def _means_of(side: int) -> Tensor:  # -> [side // COARSE, side]
+    """The matrix that takes pixels to the means of each COARSE of them."""
+    return interpolate(torch.eye(side)[None], size=max(1, side // COARSE), mode="area")[0].T.contiguous()
 
 
-def _correlations(rows: Tensor, part: Tensor) -> Tensor:  # [K, pixels], [pixels] of mean 0 and length 1 -> [K]
-    """Of the rows with a part; as that has no mean, theirs need not be taken off, which would cost another pass."""
-    squares, means = torch.linalg.vector_norm(rows, dim=1).square(), rows.mean(dim=1)
-    left = squares - rows.shape[1] * means.square()
-    found: Tensor = (rows @ part) / left.clamp(min=1e-30).sqrt()
-    return found.masked_fill(left <= LEAST_CONTRAST * squares, 0.0).clamp(-1.0, 1.0)  # rounding could take it beyond
+def _correlations(rows: Any, part: Any) -> Any:  # [K, pixels], [pixels] of mean 0 and length 1 -> [K]
+    """Of the rows with a part; as that has no mean, theirs need not be taken off, which would cost another pass.
+
+    Of arrays, and of tensors.
+    """
+    squares, means = (rows * rows).sum(axis=1), rows.mean(axis=1)
+    left = squares - rows.shape[1] * means * means
+    found = (rows @ part) / left.clip(min=1e-30) ** 0.5 * (left > LEAST_CONTRAST * squares)
+    return found.clip(-1.0, 1.0)  # rounding could take it beyond
 
 
 class StandardPlane(Task):
