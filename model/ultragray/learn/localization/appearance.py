@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeAlias
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -14,6 +17,8 @@ from torch.nn import functional
 from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training.poses import turned_by
+
+PixelArray: TypeAlias = npt.NDArray[np.float32]
 
 # Small motions of the probe: shifts along its own axes and turns about the middle of its image, all in mm.
 #
@@ -110,25 +115,25 @@ class Scale:
         """A larger frame with the pixels of this scale: means of what they cover."""
         return functional.interpolate(image[None, None], size=(self.rows, self.columns), mode="area")[0, 0]
 
-    def appearance(self, frames: Tensor) -> Tensor:  # [C, rows, columns] in [0, 1] -> [C, rows, columns]
+    def appearance(self, frames: Tensor) -> PixelArray:  # [C, rows, columns] in [0, 1] -> [C, rows, columns]
         """The structures of frames, of strength 1 where there are any."""
-        smooth = self._blurred(frames, 1.0)
+        smooth = self._blurred(frames.numpy(), 1.0)
         structure = smooth - self._blurred(smooth, NEIGHBOURHOOD)
-        strength = self._blurred(structure.square(), NEIGHBOURHOOD)
-        return structure / (strength + LEAST_STRENGTH**2).sqrt()
+        strength = self._blurred(np.square(structure), NEIGHBOURHOOD)
+        shown: PixelArray = structure / np.sqrt(strength + np.float32(LEAST_STRENGTH**2))
+        return shown
 
-    def _blurred(self, frames: Tensor, times: float) -> Tensor:
-        rows = _smoother(self.rows, times * self.sigma_rows)
-        return rows @ frames @ _smoother(self.columns, times * self.sigma_columns).mT
+    def _blurred(self, frames: PixelArray, times: float) -> PixelArray:
+        """By OpenCV: on a busy machine torch's threads wait for each other many times as long as this takes."""
+        along, across = (_weights(times * sigma) for sigma in (self.sigma_rows, self.sigma_columns))
+        return np.stack([cv2.sepFilter2D(one, -1, across, along, borderType=cv2.BORDER_REPLICATE) for one in frames])
 
 
 @lru_cache(maxsize=32)
-def _smoother(count: int, sigma: float) -> Tensor:  # [count, count]
-    """The matrix that smooths so many values by a Gaussian; beyond the ends the outermost values go on."""
+def _weights(sigma: float) -> PixelArray:  # [2 reach + 1]
+    """Of a Gaussian that smooths; beyond the ends of what is smoothed the outermost values go on."""
     if sigma < LEAST_SIGMA:
-        return torch.eye(count)
+        return np.ones(1, np.float32)
     reach = max(1, math.ceil(REACH * sigma))
-    offsets = torch.arange(-reach, reach + 1)
-    weights = torch.exp(-0.5 * (offsets / sigma).square())
-    places = (torch.arange(count)[:, None] + offsets).clamp(0, count - 1)
-    return torch.zeros(count, count).scatter_add_(1, places, (weights / weights.sum()).expand(count, -1))
+    weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma))
+    return np.asarray(weights / weights.sum(), np.float32)

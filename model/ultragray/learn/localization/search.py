@@ -20,9 +20,10 @@ from torch.quasirandom import SobolEngine
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import BoolArray, FloatArray, Probe
 from ultragray.geometry.rotations import turns_of
-from ultragray.learn.localization.appearance import Motions, Scale, displacements
+from ultragray.geometry.scan_conversion import IntArray
+from ultragray.learn.localization.appearance import Motions, PixelArray, Scale, displacements
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings, SearchKind
 from ultragray.rendering.frames import render
 from ultragray.rendering.limits import UNLIMITED, Limits
@@ -230,12 +231,12 @@ def move_together(
             placed = whole @ first
             at_rest = torch.from_numpy(scene.poses_at_rest(placed.numpy()))
             fits = [one.linearised(pose[None], stage) for one, pose in zip(searches, at_rest, strict=True)]
-            left = torch.cat([fit.left[0] for fit in fits])
-            tried.append((float(left.square().mean()), whole))
-            jacobians = (_jacobian(about, motions, pose) for pose in placed)
-            changes = torch.cat([own.T @ fit.changes[0] for own, fit in zip(jacobians, fits, strict=True)], dim=1)
-            joint = _Fit(whole[None], left[None], changes[None], torch.zeros(1, dtype=torch.int64))
-            whole = about.of_steps(_step(joint, torch.tensor([START_DAMPING], dtype=torch.float64)))[0] @ whole
+            left = np.concatenate([fit.left[0] for fit in fits])
+            tried.append((float(np.square(left).mean()), whole))
+            jacobians = (_jacobian(about, motions, pose).numpy() for pose in placed)
+            changes = np.concatenate([own.T @ fit.changes[0] for own, fit in zip(jacobians, fits, strict=True)], axis=1)
+            joint = _Fit(whole[None], left[None], changes[None], np.zeros(1, np.int64))
+            whole = about.of_steps(torch.from_numpy(_step(joint, np.array([START_DAMPING]))))[0] @ whole
         whole = min(tried, key=lambda one: one[0])[1]
     return np.asarray(whole.numpy())
 
@@ -309,45 +310,51 @@ class Places:
 
 
 def _descriptors(scale: Scale, frames: Tensor) -> Tensor:  # [C, rows, columns] -> [C, D]
-    structures = scale.appearance(frames).flatten(1)
+    structures = torch.from_numpy(scale.appearance(frames)).flatten(1)
     centred = structures - structures.mean(dim=1, keepdim=True)
     return functional.normalize(centred, dim=1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """How well poses fit at a stage."""
+    """How well poses fit at a stage.
+
+    What has a value for each pixel is NumPy's, on one thread: torch's wait for each other, on a busy machine many times
+    as long as the sums take.
+    """
 
     poses: Tensor  # [K, 4, 4]
-    left: Tensor  # [K, pixels], of the frame
-    changes: Tensor  # [K, 6, pixels] per mm, of what is left by the six numbers
-    corrections: Tensor  # [K], of the changes since they were taken
+    left: FloatArray  # [K, pixels], of the frame
+    changes: FloatArray  # [K, 6, pixels] per mm, of what is left by the six numbers
+    corrections: IntArray  # [K], of the changes since they were taken
 
     @property
-    def error(self) -> Tensor:  # [K]
-        return self.left.square().mean(dim=1)
+    def error(self) -> FloatArray:  # [K]
+        error: FloatArray = np.square(self.left).mean(axis=1)
+        return error
 
-    def after(self, steps: Tensor, poses: Tensor, left: Tensor) -> tuple[Tensor, _Fit]:  # [K, 6] mm
+    def after(self, steps: FloatArray, poses: Tensor, left: FloatArray) -> tuple[BoolArray, _Fit]:  # [K, 6] mm
         """Where steps led to something better, [K], and the fit at the better poses, its changes corrected."""
         missed = left - self.left - (steps[:, None] @ self.changes)[:, 0]
-        along = steps / steps.square().sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
-        better = left.square().mean(dim=1) < self.error
+        along = steps / np.square(steps).sum(axis=1, keepdims=True).clip(min=np.finfo(np.float64).tiny)
+        better = np.square(left).mean(axis=1) < self.error
         return better, _Fit(
-            torch.where(better[:, None, None], poses, self.poses),
-            torch.where(better[:, None], left, self.left),
+            torch.where(torch.from_numpy(better)[:, None, None], poses, self.poses),
+            np.where(better[:, None], left, self.left),
             self.changes + along[..., None] * missed[:, None],
             self.corrections + 1,
         )
 
     def best(self, count: int) -> _Fit:
         """The fit at the poses that fit best, the first of equals first."""
-        which = self.error.argsort(stable=True)[:count]
+        which = self.error.argsort(kind="stable")[:count]
         return _Fit(self.poses[which], self.left[which], self.changes[which], self.corrections[which])
 
-    def replaced(self, which: Tensor, other: _Fit) -> _Fit:  # [K], of poses that the other has
+    def replaced(self, which: BoolArray, other: _Fit) -> _Fit:  # [K], of poses that the other has
         """The fit, some of whose poses have been taken anew."""
-        parts = ((self.left, other.left), (self.changes, other.changes), (self.corrections, other.corrections))
-        return _Fit(self.poses, *(old.index_put((which,), new) for old, new in parts))
+        left, changes, corrections = self.left.copy(), self.changes.copy(), self.corrections.copy()
+        left[which], changes[which], corrections[which] = other.left, other.changes, other.corrections
+        return _Fit(self.poses, left, changes, corrections)
 
 
 class _Search:
@@ -356,32 +363,32 @@ class _Search:
     def __init__(self, frame: Tensor, probe: Probe, motions: Motions, rendered: Rendered) -> None:
         self._frame, self._probe, self._motions, self._rendered = frame, probe, motions, rendered
         self._known: dict[tuple[bytes, int, int], Tensor] = {}  # frames by pose, rows and columns
-        self._targets: dict[Stage, tuple[Scale, Tensor]] = {}
+        self._targets: dict[Stage, tuple[Scale, PixelArray]] = {}
 
     def begin(self, starts: Tensor) -> Tensor:  # [S, 4, 4] -> [K, 4, 4]
         """The starts that look most like the frame, the given one first among equals."""
         if len(starts) <= MOST_BEGUN:
             return starts
         scale, target = self._at(COARSE)
-        left = self._left(starts, scale, target).square().mean(dim=1)
-        return starts[left.argsort(stable=True)[:MOST_BEGUN]]
+        error = np.square(self._left(starts, scale, target)).mean(axis=1)
+        return starts[error.argsort(kind="stable")[:MOST_BEGUN]]
 
     def improve(self, poses: Tensor, stage: Stage) -> _Fit:  # [K, 4, 4] -> of the best `kept`
         """Steps of Levenberg and Marquardt for all poses at once."""
         scale, target = self._at(stage)
         fit = self._linearised(poses, stage, scale, target)
-        damping = torch.full((len(poses),), START_DAMPING, dtype=torch.float64)
+        damping = np.full(len(poses), START_DAMPING)
         short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is LAST else SHORT_STEP)
         for left in reversed(range(stage.steps)):
             steps = _step(fit, damping)
-            has_arrived = steps.norm(dim=1) < short_mm
+            has_arrived = np.linalg.norm(steps, axis=1) < short_mm
             was_fresh = fit.corrections == 0
-            if bool((has_arrived & was_fresh).all()):
+            if (has_arrived & was_fresh).all():
                 break
-            tried = self._motions.moved(fit.poses, steps)
+            tried = self._motions.moved(fit.poses, torch.from_numpy(steps))
             better, fit = fit.after(steps, tried, self._left(tried, scale, target))
             is_misled = ~better & ~was_fresh
-            damping = torch.where(better, damping / LESS_DAMPING, damping * torch.where(is_misled, 1.0, MORE_DAMPING))
+            damping = np.where(better, damping / LESS_DAMPING, damping * np.where(is_misled, 1.0, MORE_DAMPING))
             doubtful = is_misled | (has_arrived & ~was_fresh) | (better & (fit.corrections >= stage.corrected))
             if left and doubtful.any():
                 fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
@@ -393,7 +400,8 @@ class _Search:
         if stage is LAST:
             fit = self._linearised(pose[None], stage, scale, target, ALL)
         similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
-        deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
+        left, changes = fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape)
+        deviations = torch.from_numpy(_deviations(left, changes))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
         return Localization(
             pose=pose.numpy(),
@@ -405,7 +413,7 @@ class _Search:
             turn_deg=turn_deg,
         )
 
-    def _at(self, stage: Stage) -> tuple[Scale, Tensor]:
+    def _at(self, stage: Stage) -> tuple[Scale, PixelArray]:
         """The scale of a stage, not finer than the frame, and what the frame looks like there."""
         if stage not in self._targets:
             rows, columns = min(stage.rows, self._frame.shape[0]), min(stage.columns, self._frame.shape[1])
@@ -413,7 +421,7 @@ class _Search:
             self._targets[stage] = scale, scale.appearance(scale.resized(self._frame)[None])[0]
         return self._targets[stage]
 
-    def _left(self, poses: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [K, 4, 4] -> [K, pixels]
+    def _left(self, poses: Tensor, scale: Scale, target: PixelArray) -> FloatArray:  # [K, 4, 4] -> [K, pixels]
         return _missed(self._frames(poses, scale.rows, scale.columns), scale, target)
 
     def _frames(self, poses: Tensor, rows: int, columns: int) -> Tensor:  # [K, 4, 4] -> [K, rows, columns]
@@ -429,7 +437,7 @@ class _Search:
         return self._linearised(poses, stage, *self._at(stage))
 
     def _linearised(
-        self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, rendered: tuple[int, ...] | None = None
+        self, poses: Tensor, stage: Stage, scale: Scale, target: PixelArray, rendered: tuple[int, ...] | None = None
     ) -> _Fit:
         """The fit at poses [K, 4, 4], and its changes, by frames on either side for the numbers that are `rendered`."""
         size, numbers = (scale.rows, scale.columns), list(stage.rendered if rendered is None else rendered)
@@ -438,11 +446,12 @@ class _Search:
         seen = scale.appearance(self._frames(every, *size))
         here, after = seen[: len(poses)], seen[len(poses) :].reshape(len(poses), 2, -1, *size)
         differences = (after[:, 0] - after[:, 1]) / (2.0 * stage.probing_mm)
-        gradient = torch.stack([*torch.gradient(here, dim=(1, 2)), differences[:, numbers.index(ELEVATION)]], dim=1)
-        changes = torch.einsum("kdhw,sdhw->kshw", gradient, displacements(self._probe, *size))
+        moves = displacements(self._probe, *size).numpy()
+        by_row, by_column = np.gradient(here, axis=(1, 2))
+        by_elevation = differences[:, numbers.index(ELEVATION)]
+        changes = by_row[:, None] * moves[:, 0] + by_column[:, None] * moves[:, 1] + by_elevation[:, None] * moves[:, 2]
         changes[:, numbers] = differences
-        left = (here - target).flatten(1).double()
-        return _Fit(poses, left, changes.flatten(2).double(), torch.zeros(len(poses), dtype=torch.int64))
+        return _Fit(poses, _flat(here - target), _flat(changes), np.zeros(len(poses), np.int64))
 
 
 @lru_cache(maxsize=32)
@@ -452,21 +461,27 @@ def _beside(probe: Probe, step_mm: float) -> Tensor:  # [2, 6, 4, 4]
     return Motions.of(probe).of_steps(torch.stack([ahead, -ahead]))
 
 
-def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]
+def _missed(frames: Tensor, scale: Scale, target: PixelArray) -> FloatArray:  # [C, rows, columns] -> [C, pixels]
     """What of the frame that is looked for frames do not explain."""
-    return (scale.appearance(frames) - target).reshape(len(frames), -1).double()
+    return _flat(scale.appearance(frames) - target)
 
 
-def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
+def _flat(images: PixelArray) -> FloatArray:  # [..., rows, columns] -> [..., pixels]
+    return images.reshape(*images.shape[:-2], -1).astype(np.float64)
+
+
+def _step(fit: _Fit, damping: FloatArray) -> FloatArray:  # [K] -> [K, 6] mm
     """Downhill, damped by the curvature of each number, and not too far."""
     pixels = fit.left.shape[-1]
     slope = (fit.changes @ fit.left[..., None]) / pixels
-    curvature = fit.changes @ fit.changes.mT / pixels  # Gauss and Newton's
-    own = curvature.diagonal(dim1=1, dim2=2)
-    floor = 1e-2 * own.mean(dim=1, keepdim=True) + torch.finfo(torch.float64).tiny
-    damped = curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
-    downhill: Tensor = -torch.linalg.lstsq(damped, slope).solution[..., 0]
-    steps: Tensor = downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
+    curvature = fit.changes @ fit.changes.swapaxes(1, 2) / pixels  # Gauss and Newton's
+    own = curvature.diagonal(axis1=1, axis2=2)
+    floor = 1e-2 * own.mean(axis=1, keepdims=True) + np.finfo(np.float64).tiny
+    damped = curvature + (damping[:, None] * (own + floor) + 1e-9 * floor)[..., None] * np.eye(own.shape[1])
+    # Where nothing changes, as in a black frame, the matrix has no inverse.
+    downhill = -torch.linalg.lstsq(torch.from_numpy(damped), torch.from_numpy(slope)).solution[..., 0].numpy()
+    lengths = np.linalg.norm(downhill, axis=1, keepdims=True)
+    steps: FloatArray = downhill * (LONGEST_STEP_MM / np.maximum(lengths, LONGEST_STEP_MM))
     return steps
 
 
@@ -502,24 +517,24 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
     return torch.from_numpy(grey)
 
 
-def _deviations(left: Tensor, changes: Tensor) -> Tensor:  # [H, W], [6, H, W] per mm -> [6] mm
+def _deviations(left: FloatArray, changes: FloatArray) -> FloatArray:  # [H, W], [6, H, W] per mm -> [6] mm
     """The standard deviations of the six numbers at the best fit.
 
     What is left is alike in neighbouring pixels, and larger in some parts of the image than in others. So each block
     of the image counts as one observation of the slope: the covariance is A⁻¹ B A⁻¹, A the sum of products of changes
     and B that of the blocks' slopes (White 1980, clustered).
     """
-    slopes = functional.adaptive_avg_pool2d(changes * left, BLOCKS) * (left.numel() / (BLOCKS[0] * BLOCKS[1]))
-    slopes = slopes.reshape(6, -1)
+    edges = [np.arange(count) * side // count for side, count in zip(left.shape, BLOCKS, strict=True)]
+    slopes = np.add.reduceat(np.add.reduceat(changes * left, edges[0], axis=1), edges[1], axis=2).reshape(6, -1)
     flat = changes.reshape(6, -1)
-    inverse = torch.linalg.pinv(flat @ flat.mT, hermitian=True)
-    variances: Tensor = (inverse @ (slopes @ slopes.mT) @ inverse).diagonal()
-    return variances.clamp(min=0.0).sqrt()
+    inverse = np.linalg.pinv(flat @ flat.T, hermitian=True)
+    variances = (inverse @ (slopes @ slopes.T) @ inverse).diagonal()
+    return np.sqrt(variances.clip(min=0.0))
 
 
-def _correlation(one: Tensor, other: Tensor) -> float:
+def _correlation(one: FloatArray, other: FloatArray) -> float:
     one, other = one - one.mean(), other - other.mean()
-    return float((one * other).sum() / (one.norm() * other.norm()).clamp(min=1e-12))
+    return float((one * other).sum() / max(np.linalg.norm(one) * np.linalg.norm(other), 1e-12))
 
 
 def _three(values: Tensor) -> tuple[float, float, float]:
