@@ -265,8 +265,16 @@ def render_shown(
     is_recorded = not scene.info.made_labels
     is_plain = is_recorded and _is_plain(settings) and not (support is not None and support.masks)
     if in_bytes and names == ("bmode",) and is_plain:
-        size = {"height": settings.height, "width": settings.width}
-        grey = render_grey(scene, settings.probe, poses, **size, backend=backend, limits=limits, beam=settings.beam)
+        grey = render_grey(
+            scene,
+            settings.probe,
+            poses,
+            height=settings.height,
+            width=settings.width,
+            backend=backend,
+            limits=limits,
+            beam=settings.beam,
+        )
         if grey is not None:
             if support is not None:
                 support.note(grey.supported)

@@ -97,7 +97,7 @@ class Target:
         The first tells a frame that is the target's from one beside it, the second the way to it from some millimetres
         away. That of a frame without contrast, such as one without contact, is 0.
         """
-        some = frames.split(len(frames) if frames.is_cuda else TOGETHER)
+        some = torch.split(frames, len(frames) if frames.is_cuda else TOGETHER)
         return torch.cat([torch.as_tensor(self._similarity(few)) for few in some])
 
     def _similarity(self, frames: Tensor) -> Any:  # [K, H, W] -> [K]

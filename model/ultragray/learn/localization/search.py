@@ -399,7 +399,8 @@ class _Search:
         (scale, target), pose = self._at(stage), fit.poses[0]
         if stage is LAST:
             fit = self._linearised(pose[None], stage, scale, target, ALL)
-        similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
+        sought = _flat(target)
+        similarity = _correlation(fit.left[0] + sought, sought)
         left, changes = fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape)
         deviations = torch.from_numpy(_deviations(left, changes))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
@@ -447,7 +448,7 @@ class _Search:
         here, after = seen[: len(poses)], seen[len(poses) :].reshape(len(poses), 2, -1, *size)
         differences = (after[:, 0] - after[:, 1]) / (2.0 * stage.probing_mm)
         moves = displacements(self._probe, *size).numpy()
-        by_row, by_column = np.gradient(here, axis=(1, 2))
+        by_row, by_column = (np.asarray(np.gradient(here, axis=axis)) for axis in (1, 2))
         by_elevation = differences[:, numbers.index(ELEVATION)]
         changes = by_row[:, None] * moves[:, 0] + by_column[:, None] * moves[:, 1] + by_elevation[:, None] * moves[:, 2]
         changes[:, numbers] = differences
@@ -529,7 +530,8 @@ def _deviations(left: FloatArray, changes: FloatArray) -> FloatArray:  # [H, W],
     flat = changes.reshape(6, -1)
     inverse = np.linalg.pinv(flat @ flat.T, hermitian=True)
     variances = (inverse @ (slopes @ slopes.T) @ inverse).diagonal()
-    return np.sqrt(variances.clip(min=0.0))
+    deviations: FloatArray = np.sqrt(variances.clip(min=0.0))
+    return deviations
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
