@@ -156,6 +156,7 @@ WARM = WarmServer(
     "ultragray_workers.jobs.kinds.render_run",
     "ultragray_workers.jobs.kinds.train_run",
     "ultragray_workers.jobs.worker.run_job",
+    "ultragray_workers.jobs.worker.template",
     "ultragray_workers.jobs.worker.worker",
     "ultragray_workers.pool.worker",
     "ultragray_workers.views",
@@ -239,8 +240,9 @@ def popen(path, command, *, env, stdout=None, stderr=None, pass_fds=(), **_):
         if command[2] == "ultragray_service.cli.worker":
             files = (nothing.fileno(), 1, 2)
             return fork(path, "worker", [str(path)], files=files, end_with=signal.SIGTERM, **common)
-        files = (nothing.fileno(), stdout.fileno(), stderr.fileno(), *pass_fds)
-        return fork(path, "job", [command[3]], files=files, end_with=signal.SIGKILL, **common)
+        return fork(
+            path, "job_template", [], files=(nothing.fileno(), 1, 2, *pass_fds), end_with=signal.SIGKILL, **common
+        )
 
 
 class Hold:
@@ -291,14 +293,14 @@ def worker(path):
     return main(str(os.getppid()))
 
 
-def job(folder, device_lock, *descriptors):
-    """The process of a job, which holds the lock of its device."""
-    from ultragray_workers.jobs.worker.run_job import main
+def job_template(descriptor):
+    """The template of a worker's job processes."""
+    from ultragray_workers.jobs.worker.template import main
 
-    return main(folder, str(os.getppid()), *map(str, descriptors))
+    main(descriptor)
 
 
-FUNCTIONS = {one.__name__: one for one in (template, service, helper, worker, job)}
+FUNCTIONS = {one.__name__: one for one in (template, service, helper, worker, job_template)}
 
 
 def serve(path, run_pid):

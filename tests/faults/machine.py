@@ -20,7 +20,7 @@ _STOP_TIMEOUT_S = 30.0
 PATCHES = f"""
 import sys
 line = " ".join(sys.orig_argv)
-if "ultragray_workers.jobs.worker.run_job" in line:
+if "ultragray_workers.jobs.worker.template" in line:
     from ultragray_workers.jobs.kinds import train_run
     train_run.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
 elif "worker" in line:
@@ -128,10 +128,11 @@ class Machine:
 
     def _processes(self):
         """The processes that live, by kind; embedded workers also of servers that died."""
-        found = {"job": [], "worker": [], "server": []}
+        found = {"job": [], "template": [], "worker": [], "server": []}
         for process, kind in [(self._servers[-1:], "server"), (self._workers[-1:], "worker")]:
             found[kind] += [one.pid for one in process if one.poll() is None]
         embedded = {f"ultragray_service.cli.worker {server.pid}" for server in self._servers}
+        forks = {}  # parents by process
         for path in Path("/proc").glob("[0-9]*/cmdline"):
             try:
                 line = path.read_text().replace("\0", " ").strip()
@@ -139,8 +140,11 @@ class Machine:
                 continue
             if any(line.endswith(end) for end in embedded):
                 found["worker"].append(int(path.parent.name))
-            elif "worker.run_job" in line and str(self.artifacts) in line:
-                found["job"].append(int(path.parent.name))
+            elif "jobs.worker.template" in line:  # or a job that it has forked
+                with suppress(OSError):
+                    forks[int(path.parent.name)] = _parent(path.parent)
+        found["template"] += [pid for pid, parent in forks.items() if parent in found["worker"]]
+        found["job"] += [pid for pid, parent in forks.items() if parent in found["template"]]
         return found
 
     def halt_jobs(self):
@@ -165,6 +169,11 @@ class Machine:
     def told(self):
         """The ends of all logs, for the message of a test that fails."""
         return "\n".join(f"--- {log.name}\n{log.read_text()[-1500:]}" for log in sorted(self._logs.iterdir())[-6:])
+
+
+def _parent(process):
+    """The number of the parent of a process, by its folder of /proc."""
+    return int((process / "stat").read_text().rpartition(")")[2].split()[1])
 
 
 def _kill(pids):

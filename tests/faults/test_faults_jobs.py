@@ -98,7 +98,7 @@ class Killer:
     def __init__(self, machine, total_steps):
         self._machine, self._chance = machine, random.Random(SEED)
         chance = self._chance
-        kinds = [("job", "worker", "server", "all")[number % 4] for number in range(KILLS)]
+        kinds = [("job", "worker", "server", "template", "all")[number % 5] for number in range(KILLS)]
         moments = [("steps", "soon", "finishing", "rendering")[number % 4] for number in range(KILLS)]
         chance.shuffle(kinds)
         chance.shuffle(moments)

@@ -120,6 +120,15 @@ def is_training(job):
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
+def _children(pid):
+    """The processes that one has forked for jobs, or to fork them."""
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended, or its thread has
+            for child in children.read_text().split():
+                if "jobs.worker.template" in Path(f"/proc/{child}/cmdline").read_text():
+                    yield int(child)
+
+
 class RunningWorker:
     """A worker in a process of its own. `options` are those of `work`, and `host`: the name that its host has."""
 
@@ -159,12 +168,12 @@ class RunningWorker:
 
     def job_process(self):
         """The process of the job at hand."""
-        for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
-            with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended, or its thread has
-                for pid in children.read_text().split():
-                    if "worker.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
-                        return int(pid)
-        return None
+        template = self.template()
+        return None if template is None else next(_children(template), None)
+
+    def template(self):
+        """The process that forks those of jobs."""
+        return next(_children(self.process.pid), None)
 
 
 @pytest.fixture

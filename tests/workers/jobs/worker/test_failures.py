@@ -26,7 +26,7 @@ DISK_BYTES = 8 * 2**20
 # The loss of trainings with batches of three is NaN from the third step on.
 DIVERGENCE = """
 import sys
-if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
+if "ultragray_workers.jobs.worker.template" in sys.orig_argv:
     from ultragray.learn.training import batch
     image_loss, calls = batch.image_loss, []
     def broken(rendered, truth, *settings):
@@ -182,13 +182,13 @@ def test_memory_that_does_not_suffice(store, artifact_folder, start_worker, unti
 
 @contextmanager
 def memory_group():
-    """A control group in which the kernel kills what takes more than 24 MiB; skips where none can be made."""
+    """A control group in which the kernel kills what takes more than 8 MiB of its own; skips where none can be made."""
     version_1 = Path("/sys/fs/cgroup/memory")
     parent, limit = (version_1, "limit_in_bytes") if version_1.is_dir() else (version_1.parent, "max")
     group = parent / f"ultragray-test-{os.getpid()}"
     try:
         group.mkdir()
-        (group / f"memory.{limit}").write_text(str(24 * 2**20))
+        (group / f"memory.{limit}").write_text(str(8 * 2**20))
     except OSError as error:
         pytest.skip(f"the kernel's own killing is not tried: no control group can be made here: {error}")
     try:

@@ -1,8 +1,8 @@
-"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID`.
+"""The work of a job's process, which its worker's `template` has forked.
 
-It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
-that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from, and files
-that cannot be used (a share that has gone) with FOLDER_LOST: it may be started again.
+It dies with the template, and so with its worker, works alone in the folder, and as its last act says in outcome.json
+how the job ended. A job that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint
+to go on from, and files that cannot be used (a share that has gone) with FOLDER_LOST: it may be started again.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _FOLDERS = re.compile(r"(?<![\w./:])/(?:[^\s/:,;'\"()]+/)+")  # of an absolute p
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
-def main(folder_path: str, worker_pid: str) -> int:
+def main(folder_path: str, template: int) -> int:
     """The exit code: 0 where outcome.json says how the job ended."""
     end_with_parent(signal.SIGKILL)
-    if os.getppid() != int(worker_pid):  # it died before the line above
+    if os.getppid() != template:  # it died before the line above
         return STOPPED
     received: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
@@ -110,7 +110,3 @@ def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:
     with suppress(OSError):
         sys.stderr.write(f"failed: {shown}\n")
     return Outcome(error=error, reason=shown, progress=job_run.progress)
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

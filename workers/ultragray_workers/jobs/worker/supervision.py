@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -40,6 +41,7 @@ from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
     STOP_WAIT_S,
+    JobTemplate,
     Watchdog,
     end_process_of_another_worker,
     end_with_checkpoint,
@@ -96,6 +98,7 @@ class Supervisor:
 
     def __init__(self, config: WorkerConfig, jobs: JobDatabase, gate: Gate) -> None:
         self.config, self.jobs, self.gate = config, jobs, gate
+        self.template = JobTemplate(config.threads)
         self.stopping = threading.Event()
         self.moved_at_s = time.monotonic()
         self.is_draining = False  # an administrator wants the job at hand to go to another worker
@@ -288,7 +291,7 @@ class _JobAtHand:
         """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
         supervisor, row, config = self._supervisor, self._row, self._config
         url = supervisor.jobs.url if is_in_shards(row.summary) else None  # others do without the database
-        with job_process(self._folder, self._device.fileno(), config.threads, url) as process:
+        with job_process(supervisor.template, self._folder, self._device.fileno(), url) as process:
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
             is_given_back = False
@@ -317,13 +320,14 @@ class _JobAtHand:
                         with suppress(DatabaseUnavailable):  # the work goes on meanwhile
                             self._raise_unless_held()
                         watched_at_s = time.monotonic()
-                    time.sleep(_POLL_INTERVAL_S)
+                    with suppress(subprocess.TimeoutExpired):
+                        process.wait(_POLL_INTERVAL_S)
             finally:
                 self._add_run_time(watchdog.look())
             if is_given_back:
                 self._telling.tell_last()
                 self._give_back()
-        return process.returncode
+        return process.wait()
 
     def _publish(self, scene: str, outcome: Outcome, files: Files) -> Outcome:
         """Serves the scene, unless the job was cancelled first; how the job ended then. Raises Superseded."""

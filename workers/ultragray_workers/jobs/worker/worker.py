@@ -120,16 +120,19 @@ def work(
 def _take_jobs(jobs: JobDatabase, worker: str, gate: Gate, supervisor: Supervisor, stop: threading.Event) -> None:
     """Does one job after another until `stop` is set."""
     rounds = Rounds("taking jobs", _log)
-    while not stop.is_set():
+    with contextlib.closing(supervisor.template) as template:
         with rounds.round():
-            row = None
-            with contextlib.suppress(UltragrayError, SQLAlchemyError):  # the heartbeat tells of a database that is away
-                row = queue.take(jobs.engine, worker, gate.opens())
-            if row is not None:
-                supervisor.supervise(row)
-                continue
-            gate.close()
-        stop.wait(POLLING_INTERVAL_S)
+            template.start()  # before the first job comes
+        while not stop.is_set():
+            with rounds.round():
+                row = None
+                with contextlib.suppress(UltragrayError, SQLAlchemyError):  # the heartbeat tells of a lost database
+                    row = queue.take(jobs.engine, worker, gate.opens())
+                if row is not None:
+                    supervisor.supervise(row)
+                    continue
+                gate.close()
+            stop.wait(POLLING_INTERVAL_S)
 
 
 @contextlib.contextmanager
