@@ -1,13 +1,15 @@
 """Files are complete or absent, linked or copied, mapped where they are arrays."""
 
 import errno
+import hashlib
 import os
 import pickle
 
 import numpy as np
 import pytest
 
-from ultragray.files import atomic_path, link_or_copy, map_npy, remove_stale_temporaries, write_whole
+from ultragray import files
+from ultragray.files import StreamedFile, atomic_path, link_or_copy, map_npy, remove_stale_temporaries, write_whole
 
 
 @pytest.fixture
@@ -42,6 +44,20 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path):
         interrupted()
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["scene.ugr"]
+
+
+def test_a_file_is_hashed_and_brought_to_the_disk_while_it_is_written(tmp_path, monkeypatch):
+    path, synced, dropped = tmp_path / "frames", [], []
+    monkeypatch.setattr(files, "_SYNC_BYTES", 10)
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: synced.append(path.stat().st_size))
+    monkeypatch.setattr(os, "posix_fadvise", lambda descriptor, start, length, advice: dropped.append((start, length)))
+    with StreamedFile(path) as file:
+        for part in (b"head", np.arange(12, dtype=np.uint8).reshape(3, 4).data, b"", b"tail", b"of it"):
+            assert file.write(part) == memoryview(part).nbytes
+        assert file.tell() == 25
+    assert path.read_bytes() == b"head" + bytes(range(12)) + b"tailof it"
+    assert file.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (synced, dropped) == ([16], [(0, 16)])
 
 
 def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):

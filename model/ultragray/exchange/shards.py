@@ -6,7 +6,6 @@ frame of 64x64 pixels. Times and owners are 0, so that the same frames are the s
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,7 @@ from ultragray.exchange.batches import BatchPlan, ShardEntry
 from ultragray.exchange.exports import ExportHeader
 from ultragray.exchange.exports.exporter import stored_pixels
 from ultragray.exchange.rendering import assess_by_rendering, render_portions, written_behind
-from ultragray.files import file_sha256
+from ultragray.files import StreamedFile, file_sha256
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.limits import UNLIMITED, Limits
@@ -36,19 +35,8 @@ _MAX_MEMBER = 8**11 - 1  # bytes: what the field of a header holds
 _FIGURE_DIGITS = 6
 
 
-class ShardTar:
-    """A tar that is written portion by portion, and hashed on the way."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("wb")
-        self._digest = hashlib.sha256()
-        self.bytes = 0
-
-    def __enter__(self) -> ShardTar:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
+class ShardTar(StreamedFile):
+    """A tar that is written portion by portion."""
 
     def add(
         self,
@@ -68,19 +56,14 @@ class ShardTar:
             rounded = {name: None if value is None else round(value, _FIGURE_DIGITS) for name, value in figures_now}
             document = {"pose": pose, **rounded}
             parts += _member(f"{key}.json", json.dumps(document).encode())
-        self._write(b"".join(parts))
+        self.write(b"".join(parts))
 
     def finish(self) -> str:
         """Write the end of the tar; its SHA-256, hexadecimal. Raises OSError."""
-        end = self.bytes + 2 * _BLOCK
-        self._write(bytes(2 * _BLOCK + -end % _RECORD))
-        self._file.flush()
-        return self._digest.hexdigest()
-
-    def _write(self, data: bytes) -> None:
-        self._file.write(data)
-        self._digest.update(data)
-        self.bytes += len(data)
+        end = self.tell() + 2 * _BLOCK
+        self.write(bytes(2 * _BLOCK + -end % _RECORD))
+        self.flush()
+        return self.sha256
 
 
 def npy_head(frame: PixelArray) -> bytes:
@@ -187,7 +170,7 @@ class ShardRenderer:
             file=plan.file_name(shard),
             first=numbers.start,
             frames=len(numbers),
-            bytes=tar.bytes,
+            bytes=tar.tell(),
             sha256=digest,
             renderer=self.renderer,
             plan=plan.identity,

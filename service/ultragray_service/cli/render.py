@@ -183,7 +183,7 @@ def render_frames(
         seen = assess_by_rendering(scene, settings, assess, backend=backend)
         poses, extrapolations = assessed_poses(sampler, base, settings.probe, seen, settings.least_confidence)
     with counted("rendering", len(poses)) as report:
-        found = render_to_file(
+        found, _ = render_to_file(
             output,
             format,
             scene,

@@ -39,7 +39,7 @@ def written(path, scene, settings, **more):
 def test_a_file_tells_how_its_frames_are_shown(tmp_path, random_scene, monkeypatch, display):
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 2)
     scene, asked, done = random_scene(60), settings(display), []
-    found = written(tmp_path / "frames.npz", scene, asked, before_portion=done.append)
+    found, _ = written(tmp_path / "frames.npz", scene, asked, before_portion=done.append)
     assert done == [0, 2, 4, 5]
     coverage = render(scene, PROBE, POSES, height=24, width=20, outputs=("coverage",)).coverage
     shares = [one.supported_share for one in found]

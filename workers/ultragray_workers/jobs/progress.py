@@ -73,6 +73,7 @@ class Outcome:
     error: str | None = None  # stable reason, such as DATASET_INVALID; None: it succeeded
     reason: str | None = None  # one sentence
     artifacts: tuple[str, ...] = ()
+    sha256: dict[str, str] = field(default_factory=dict)  # of those artifacts that were hashed while they were written
     metrics: dict[str, float] = field(default_factory=dict)
     progress: Progress = Progress()
     attempts: int = 1  # how often a process was started for it

@@ -7,14 +7,22 @@ What a format can hold is known without importing what it needs. Free of torch.
 from __future__ import annotations
 
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader
-from ultragray.exchange.exports.formats import FORMATS, Add, Format, check_format, export_to, exporter_class, format_of
+from ultragray.exchange.exports.formats import (
+    FORMATS,
+    Format,
+    Writing,
+    check_format,
+    export_to,
+    exporter_class,
+    format_of,
+)
 
 __all__ = [
     "FORMATS",
-    "Add",
     "ExportHeader",
     "Exporter",
     "Format",
+    "Writing",
     "check_format",
     "export_to",
     "exporter_class",

@@ -16,8 +16,8 @@ from typing import IO, Any
 import numpy as np
 
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader
-from ultragray.exchange.exports.formats import Add
-from ultragray.files import atomic_path, npy_bytes
+from ultragray.exchange.exports.formats import Writing
+from ultragray.files import StreamedFile, atomic_path, npy_bytes
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray, png_file
 from ultragray.scene.confidence import Extrapolation
@@ -28,7 +28,8 @@ class NpzExporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
+        self._file = self._held.enter_context(StreamedFile(self._path))
+        self._archive = self._held.enter_context(zipfile.ZipFile(self._file, "w"))  # type: ignore[call-overload]
         first, *others = header.settings.outputs
         self._waiting: dict[str, IO[bytes]] = {
             name: self._held.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
@@ -41,7 +42,8 @@ class NpzExporter(Exporter):
             np.lib.format.write_array_header_1_0(file, described)
 
     def _member(self, name: str) -> IO[bytes]:
-        return self._archive.open(f"{name}.npy", "w", force_zip64=True)
+        member: IO[bytes] = self._archive.open(f"{name}.npy", "w", force_zip64=True)
+        return member
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         for name, file in self._files.items():
@@ -59,13 +61,16 @@ class NpzExporter(Exporter):
         for name, value in described.items():
             with self._member(name) as member:
                 np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
+        self._archive.close()
+        self.sha256 = self._file.sha256
 
 
 class TarExporter(Exporter):
     """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
 
     def _open(self) -> None:
-        self._tar = self._held.enter_context(tarfile.TarFile(self._path, "w"))
+        self._file = self._held.enter_context(StreamedFile(self._path))
+        self._tar = self._held.enter_context(tarfile.TarFile(mode="w", fileobj=self._file))  # type: ignore[arg-type]
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         for place in range(count):
@@ -79,6 +84,10 @@ class TarExporter(Exporter):
             document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
             self._member(f"{number:06d}.json", json.dumps(document).encode())
 
+    def _finish(self) -> None:
+        self._tar.close()
+        self.sha256 = self._file.sha256
+
     def _member(self, name: str, data: bytes) -> None:
         member = tarfile.TarInfo(name)
         member.size = len(data)
@@ -89,8 +98,8 @@ FRAMES_FILE = "frames.json"
 
 
 @contextmanager
-def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
-    """A function that takes the rendered frames in order, and writes frame_00012_bmode.png and so on."""
+def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Writing]:
+    """The writing of frame_00012_bmode.png and so on."""
     documents: list[dict[str, Any]] = []
 
     def add(frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
@@ -102,6 +111,6 @@ def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
                 (folder / f"frame_{number:05d}_{name}.png").write_bytes(data)
             documents.append({"frame": number, "pose": header.poses[number].tolist(), **extrapolation.figures()})
 
-    yield add
+    yield Writing(add)
     with atomic_path(folder / FRAMES_FILE) as temporary:
         temporary.write_text(json.dumps(documents), encoding="utf-8")

@@ -84,6 +84,7 @@ class Exporter(ABC):
         self._path, self._header, self._done = path, header, 0
         self._extrapolations: list[Extrapolation] = []  # of the frames that are there
         self._held = ExitStack()
+        self.sha256: str | None = None  # of the whole file, where a subclass has hashed it on the way
         try:
             self._open()
         except BaseException:

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -163,22 +162,30 @@ def exporter_class(name: str) -> type[Exporter]:
         raise missing_extra(error, f"format {name}", field="format") from error
 
 
-# Takes the next frames, each output [B, H, W], and the extrapolation of each, [B].
-Add: TypeAlias = Callable[[Mapping[str, PixelArray], Sequence[Extrapolation]], None]
+@dataclass
+class Writing:
+    """The writing of rendered frames into a file: called with the next ones, in order."""
+
+    add: Callable[[Mapping[str, PixelArray], Sequence[Extrapolation]], None]
+    sha256: str | None = None  # of the file once it is whole, where it is known without reading it again
+
+    def __call__(self, frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
+        """Write the next frames, each output [B, H, W], with the extrapolation of each, [B]. Raises OSError."""
+        self.add(frames, extrapolations)
 
 
 @contextmanager
-def export_to(path: str | Path, format: str, header: ExportHeader) -> Iterator[Add]:
-    """A function that writes the rendered frames, in order; at the end `path` is there, whole, or not at all.
+def export_to(path: str | Path, format: str, header: ExportHeader) -> Iterator[Writing]:
+    """The writing of a file; at the end `path` is there, whole, or not at all.
 
     Raises ExtraMissing, InvalidArgument, OSError.
     """
-    with atomic_path(path) as temporary, _exporting(temporary, format, header) as add:
-        yield add
+    with atomic_path(path) as temporary, _exporting(temporary, format, header) as writing:
+        yield writing
 
 
 @contextmanager
-def _exporting(path: Path, format: str, header: ExportHeader) -> Iterator[Add]:
+def _exporting(path: Path, format: str, header: ExportHeader) -> Iterator[Writing]:
     exporter = exporter_class(format)(path, header)
 
     def add(frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
@@ -186,12 +193,14 @@ def _exporting(path: Path, format: str, header: ExportHeader) -> Iterator[Add]:
         stored = {name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in outputs}
         exporter.add(stored, extrapolations)
 
+    writing = Writing(add)
     try:
-        yield add
+        yield writing
     except BaseException:
         exporter.abandon()
         raise
     exporter.close()
+    writing.sha256 = exporter.sha256
 
 
 def export_bytes(

@@ -21,6 +21,7 @@ from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.exchange.exports import FORMATS, check_format, export_to
 from ultragray.exchange.rendering import written_behind
+from ultragray.files import file_sha256
 from ultragray.installation import install_advice
 from ultragray.rendering.settings import Contact, Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
@@ -167,6 +168,15 @@ def test_whole_or_not_at_all(tmp_path, format):
         break_off()
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "before"
+
+
+@pytest.mark.parametrize("format", INSTALLED)
+def test_what_is_written_from_end_to_end_is_hashed_on_the_way(tmp_path, format):
+    outputs = ("bmode",) if FORMATS[format].bmode_only else ("bmode", "coverage")
+    path = tmp_path / f"frames{FORMATS[format].suffix}"
+    with export_to(path, format, header(outputs, FORMATS[format].dtypes[0])) as writing:
+        writing(rendered(outputs), TOLD)
+    assert writing.sha256 == (file_sha256(path) if format in ("npz", "tar") else None)
 
 
 @pytest.mark.parametrize("format", INSTALLED)

@@ -12,6 +12,7 @@ from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, re
 from ultragray.contract import to_dict as to_json
 from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, InvalidProbe, LowConfidence
 from ultragray.exchange import rendering
+from ultragray.files import file_sha256
 from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Below
@@ -60,6 +61,7 @@ def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work):
     examples = [f"example_{place:05d}.png" for place in (0, 10, 20, 29, 39, 49)]
     assert outcome.artifacts == (*examples, "frames.npz")
     assert outcome.metrics == {}  # the scene knows no confidence
+    assert outcome.sha256 == {"frames.npz": file_sha256(asked.folder.artifacts / "frames.npz")}
     drawn = cv2.imread(str(asked.folder.artifacts / examples[0]), cv2.IMREAD_UNCHANGED)
     assert (drawn.dtype, max(drawn.shape)) == (np.uint8, render_run.EXAMPLE_SIDE)
     assert (asked.progress.frames_done, asked.progress.frames) == (50, 50)

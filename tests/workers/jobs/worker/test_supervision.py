@@ -1,5 +1,7 @@
 """Jobs whose process had finished when their worker died: another worker says how they ended."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ from ..conftest import path_of, request_of, train_job
 def finished(store, artifact_folder):
     """A job and its folder, as a process that was done and a worker of this host that was killed leave it."""
 
-    def make(scene):
+    def make(scene, **told):
         job, _ = store.submit(train_job(scene), priority=len(store.list()[0]))  # it goes first
         row = queue.take(store.database.engine, "dead", queue.demands_waiting(store.database.engine))
         queue.put_back(store.database.engine, row)
@@ -34,7 +36,8 @@ def finished(store, artifact_folder):
         folder.write_request(request_of({}, artifact_folder, row.number))
         with folder.new_artifacts() as artifacts:
             (artifacts / f"{scene}.ugr").write_bytes(b"made")
-        folder.write_outcome(Outcome(artifacts=folder.artifact_names(), progress=Progress(step=20, steps=20)))
+        outcome = Outcome(artifacts=folder.artifact_names(), progress=Progress(step=20, steps=20), **told)
+        folder.write_outcome(outcome)
         folder.reserve.touch()
         (folder.path / ".progress.json.abc.tmp").touch()
         return job, folder
@@ -44,7 +47,7 @@ def finished(store, artifact_folder):
 
 def test_what_was_made_is_served_and_what_was_left_is_removed(store, artifact_folder, finished, start_worker, until):
     good, folder = finished("good")
-    late, _ = finished("late")
+    late, _ = finished("late", sha256={"late.ugr": "hashed while it was written"})
     scenes = artifact_folder / "scenes"
     scenes.mkdir()
     (scenes / "late.ugr").write_bytes(b"somebody else's")
@@ -58,6 +61,9 @@ def test_what_was_made_is_served_and_what_was_left_is_removed(store, artifact_fo
     assert (late.state, late.error) == (JobState.FAILED, "SCENE_EXISTS"), late
     assert "choose another name" in (late.reason or "")
     assert path_of(store.artifact(late.id, "late.ugr")).read_bytes() == b"made"
+    named = {job.id: queue.row_of(store.database.engine, job.id).files.artifacts for job in (good, late)}
+    assert named[good.id]["good.ugr"].sha256 == hashlib.sha256(b"made").hexdigest()
+    assert named[late.id]["late.ugr"].sha256 == "hashed while it was written"  # it is not read again
     assert (scenes / "late.ugr").read_bytes() == b"somebody else's"
 
 

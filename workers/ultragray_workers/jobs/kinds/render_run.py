@@ -54,8 +54,9 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
     with job_run.folder.new_artifacts() as folder:
-        found = render_to_file(
-            folder / f"frames{job.file_format.suffix}",
+        name = f"frames{job.file_format.suffix}"
+        found, sha256 = render_to_file(
+            folder / name,
             job.file_format.name,
             scene,
             settings,
@@ -73,7 +74,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     if confidences:
         least, mean, greatest = min(confidences), fmean(confidences), max(confidences)
         metrics = {"least_confidence": least, "mean_confidence": mean, "greatest_confidence": greatest}
-    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+    hashes = {} if sha256 is None else {name: sha256}
+    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics, sha256=hashes)
 
 
 def _write_examples(

@@ -296,8 +296,8 @@ class Telling:
         self._run_version, self._run_files = version, stored
         return stored
 
-    def _upload(self, path: Path, name: str) -> StoredFile:
-        stored = StoredFile(f"{self._prefix}/{name}", path.stat().st_size, file_sha256(path))
+    def _upload(self, path: Path, name: str, sha256: str | None = None) -> StoredFile:
+        stored = StoredFile(f"{self._prefix}/{name}", path.stat().st_size, sha256 or file_sha256(path))
         self._require_storage()
         self._storage.upload(path, stored.key)
         return stored
@@ -312,7 +312,8 @@ class Telling:
             # The process of a batch itself has put its shards into the storage.
             for name in () if is_in_shards(self._row.summary) else outcome.artifacts:
                 if name not in artifacts:
-                    artifacts[name] = self._upload(self._folder.artifacts / name, f"artifacts/{name}")
+                    path, sha256 = self._folder.artifacts / name, outcome.sha256.get(name)
+                    artifacts[name] = self._upload(path, f"artifacts/{name}", sha256)
             run: Mapping[str, StoredFile] = {}
             if outcome.error is not None:  # a retry goes on from it
                 run = self._told_run(is_last=True) or self._files.run
