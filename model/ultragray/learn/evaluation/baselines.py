@@ -284,7 +284,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
     values = np.zeros((sides, len(points)))
     for frame in frames:
         pose = sweep.poses[frame]
-        elevation = (points - pose[:3, 3]) @ pose[:3, 1]
+        elevation = points @ pose[:3, 1] - pose[:3, 3] @ pose[:3, 1]
         for side in range(sides):
             height = elevation if side == 0 else -elevation
             nearer = np.flatnonzero((height >= 0) & (height < distances[side]))

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import cv2
@@ -66,6 +66,20 @@ def frame_metrics(rendered: Tensor, truth: Tensor) -> list[FrameMetrics]:
     Raises InvalidArgument where the shapes differ or `rendered` is not finite, and InvalidImageSize for images smaller
     than the window of MS-SSIM.
     """
+    found: list[FrameMetrics] = []
+    for pair in _pairs(rendered, truth):
+        columns = [_psnr_db(*pair), _ms_ssim(*pair), *_gradient_similarity(*pair)]
+        found += [FrameMetrics(*values) for values in torch.stack(columns, dim=1).tolist()]
+    return found
+
+
+def ms_ssim(rendered: Tensor, truth: Tensor) -> list[float]:  # [C, H, W] both -> [C]
+    """The MS-SSIM of each frame alone; takes and raises what `frame_metrics` does."""
+    return [value for pair in _pairs(rendered, truth) for value in _ms_ssim(*pair).tolist()]
+
+
+def _pairs(rendered: Tensor, truth: Tensor) -> Iterator[tuple[Tensor, Tensor]]:  # [C, H, W] both
+    """Checked frames in float64, some at a time, [c, 1, H, W] both."""
     if rendered.ndim != 3 or rendered.shape != truth.shape:
         raise InvalidArgument(
             f"rendered and true frames must both be [C, H, W], got {list(rendered.shape)} and {list(truth.shape)}"
@@ -73,13 +87,9 @@ def frame_metrics(rendered: Tensor, truth: Tensor) -> list[FrameMetrics]:
     if not bool(torch.isfinite(rendered).all()):
         raise InvalidArgument("rendered frames must be finite, got NaN or infinity", field="rendered")
     chunk = max(1, CHUNK_PIXELS // max(1, truth.shape[1] * truth.shape[2]))
-    found: list[FrameMetrics] = []
-    with torch.no_grad():
-        for first in range(0, len(rendered), chunk):
-            pair = [part[first : first + chunk, None].double().clamp(0.0, 1.0) for part in (rendered, truth)]
-            columns = [_psnr_db(*pair), _ms_ssim(*pair), *_gradient_similarity(*pair)]
-            found += [FrameMetrics(*values) for values in torch.stack(columns, dim=1).tolist()]
-    return found
+    for first in range(0, len(rendered), chunk):
+        some, true = (part[first : first + chunk, None].detach().double().clamp(0.0, 1.0) for part in (rendered, truth))
+        yield some, true
 
 
 def mean_and_std(frames: Sequence[FrameMetrics]) -> tuple[FrameMetrics, FrameMetrics]:

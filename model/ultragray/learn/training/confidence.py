@@ -26,8 +26,8 @@ from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotation_angles_deg
-from ultragray.learn.evaluation.baselines import interpolate_planes
-from ultragray.learn.evaluation.metrics import frame_metrics
+from ultragray.learn.evaluation import metrics
+from ultragray.learn.evaluation.baselines import FrameArray, interpolate_planes
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep, rendered_parts
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
@@ -136,13 +136,17 @@ class Neighbours:
         order = np.argsort(self._distances_mm[row], kind="stable")
         return tuple(order[among[order]][:MOST_HELPERS].tolist())
 
-    def predict(self, row: int, helpers: tuple[int, ...], *, is_nearest: bool) -> Prediction:
+    def predict(self, row: int, helpers: tuple[int, ...]) -> tuple[FrameArray, ViewMeasures]:  # [h, w] in [0, 1]
+        """A small picture of a target, and how its pose lies to its helpers."""
         some, target = self._small.select(list(helpers)), self.targets[row]
         pose = self._small.poses[target : target + 1]
-        picture = torch.from_numpy(interpolate_planes(some, pose))
-        truth = torch.from_numpy(self._small.images[target : target + 1]).float().div_(255.0)
         measures = TrainingViews(some.poses, some.probe).measure(pose, some.probe)
-        return Prediction(int(target), is_nearest, frame_metrics(picture, truth)[0].ms_ssim, measures)
+        return interpolate_planes(some, pose)[0], measures
+
+    def scores(self, rows: Sequence[int], pictures: Sequence[FrameArray]) -> list[float]:
+        """The MS-SSIM of small pictures of targets."""
+        truth = torch.from_numpy(self._small.images[self.targets[list(rows)]]).float().div_(255.0)
+        return metrics.ms_ssim(torch.from_numpy(np.stack(pictures)), truth)
 
 
 def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
@@ -155,6 +159,7 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
 
 
 MOST_TARGETS = 192  # frames that are predicted
+SCORED_AT_ONCE = 64  # predictions: one by one, torch's threads took most of the time to find each other
 BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
 
 
@@ -164,15 +169,20 @@ def one_sided(sweep: Sweep) -> list[Prediction]:
     A sweep of one or two frames has none.
     """
     neighbours, path = Neighbours(sweep, MOST_TARGETS), path_mm(sweep)
-    found = []
+    asked = []  # row, helpers, whether they are the nearest on a side
     for row, target in enumerate(neighbours.targets):
         for ahead in (path - path[target], path[target] - path):
             choices = (neighbours.helpers(row, ahead > beyond_mm) for beyond_mm in BEYOND_MM)
-            found += [
-                neighbours.predict(row, helpers, is_nearest=not number)
-                for number, helpers in enumerate(dict.fromkeys(choices))
-                if len(helpers) > 1
+            asked += [
+                (row, helpers, not number) for number, helpers in enumerate(dict.fromkeys(choices)) if len(helpers) > 1
             ]
+    found = []
+    for first in range(0, len(asked), SCORED_AT_ONCE):
+        rows, helpers, nearest = zip(*asked[first : first + SCORED_AT_ONCE], strict=True)
+        pictures, measures = zip(*map(neighbours.predict, rows, helpers), strict=True)
+        scores = neighbours.scores(rows, pictures)
+        targets = neighbours.targets[list(rows)].tolist()
+        found += [Prediction(*one) for one in zip(targets, nearest, scores, measures, strict=True)]
     return found
 
 

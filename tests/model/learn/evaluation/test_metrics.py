@@ -15,7 +15,7 @@ from skimage.metrics import structural_similarity
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import InvalidArgument, InvalidImageSize
 from ultragray.learn.evaluation import metrics
-from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_and_std, ms_ssim_scales
+from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_and_std, ms_ssim, ms_ssim_scales
 from ultragray.learn.evaluation.speckle import FrameSpeckle, Speckle, compare_speckle, summarize
 from ultragray.rendering.display import FRAME_RANGE_DB
 
@@ -59,6 +59,7 @@ def test_ms_ssim_agrees_with_another_implementation(size):
     expected = pytorch_msssim.ms_ssim(rendered[:, None], truth[:, None], data_range=1.0, size_average=False)
     found = [frame.ms_ssim for frame in frame_metrics(rendered, truth)]
     assert found == pytest.approx(expected.tolist(), abs=1e-5)
+    assert ms_ssim(rendered, truth) == found
 
 
 @pytest.mark.parametrize(

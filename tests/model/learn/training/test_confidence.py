@@ -9,7 +9,7 @@ from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate, render_sweep
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training import TrainingConfig, run, train
+from ultragray.learn.training import TrainingConfig, confidence, run, train
 from ultragray.learn.training.confidence import (
     BEYOND_MM,
     GAIN_QUANTILE,
@@ -219,6 +219,16 @@ def test_hard_is_where_neighbours_do_not_tell(side):
     hardness = hardness_of_views(sweep, one_sided(sweep))
     assert hardness.shape == (24,)
     assert hardness[:9].max() < -1.0 < 1.0 < hardness[15:].min()
+
+
+def test_predictions_are_the_same_however_many_are_scored_at_once(monkeypatch):
+    sweep = changing_sweep(8, 32)
+    found = []
+    for at_once in (confidence.SCORED_AT_ONCE, 3, 1):
+        monkeypatch.setattr(confidence, "SCORED_AT_ONCE", at_once)
+        found.append([(one.target, one.is_nearest, one.ms_ssim) for one in one_sided(sweep)])
+    assert len(found[0]) > 8
+    assert found[0] == found[1] == found[2]
 
 
 def test_a_gap_is_hard_where_its_edges_differ():
