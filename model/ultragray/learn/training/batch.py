@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,16 +42,16 @@ class Batch:
         generator: torch.Generator,
     ) -> Batch:
         poses, nearest, neighbours = train.poses[own.numpy()], own, own[:, None].expand(-1, 2)
-        truth, weights = images[cuda.upload(own, images.device)].float().div_(255.0), None
+        truth, weights = [_grey_values(images, own)], None
         if between is not None:
             views = between.draw(count, generator)
             poses = np.concatenate([poses, views.poses])
             nearest = torch.cat([own, torch.from_numpy(views.places.nearer)])
             neighbours = torch.cat([neighbours, torch.from_numpy(views.places.frames)])
-            truth, weights = torch.cat([truth, views.images]), views.weights
+            truth, weights = [*truth, views.images], views.weights
         if config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(config.out_of_plane_mm, generator))
-        return cls(poses, nearest, neighbours, truth, weights)
+        return cls(poses, nearest, neighbours, _joined(truth), weights)
 
     @property
     def can_be_halved(self) -> bool:
@@ -89,3 +90,18 @@ class Batch:
             return loss
         neighbours = cuda.upload(self.neighbours, shadowed.device)
         return loss + absorption_loss(frames["transmittance"], shadowed, neighbours, config.absorption_penalty)
+
+
+def _grey_values(images: Tensor, frames: Tensor) -> Tensor:  # [F, H, W] uint8, [K] -> [K, H, W] in [0, 1]
+    """Frames in float32. On a CPU by numpy, here and below: torch's threads would fight with the kernel's, and took a
+    tenth of a step on a busy machine.
+    """
+    if images.device.type == "cpu":
+        return torch.from_numpy(images.numpy()[frames.numpy()] / np.float32(255.0))
+    return images[cuda.upload(frames, images.device)].float().div_(255.0)
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    if len(parts) == 1:
+        return parts[0]
+    return torch.from_numpy(np.concatenate(parts)) if parts[0].device.type == "cpu" else torch.cat(list(parts))
