@@ -329,9 +329,10 @@ def test_a_real_frame_may_come_from_another_program(service, http, robot):
             break
         if sequence == 1:
             taken_s = time.time()
-        elif sequence > 3:
+        elif time.time() - taken_s > 0.05:  # when the clocks agree better than poses are apart
             age_ms = 1e3 * (time.time() - taken_s)
-            http.post(path, params={"age_ms": age_ms, **size}, content=data).raise_for_status()
+            sent = http.post(path, params={"age_ms": age_ms, **size}, content=data)
+            assert sent.is_success, sent.text
     assert 0.0 < about["preview"]["real_age_ms"] < 60_000.0
     assert http.post("/v1/streams/none/real-frames", content=b"").status_code == 404
     both = http.post(path, params={"age_ms": 1, "client_time_ms": 2}, content=b"")

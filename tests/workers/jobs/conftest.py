@@ -129,6 +129,11 @@ def _children(pid):
                     yield int(child)
 
 
+def _leads_a_session(pid):
+    with suppress(ProcessLookupError):
+        return os.getsid(pid) == pid
+
+
 class RunningWorker:
     """A worker in a process of its own. `options` are those of `work`, and `host`: the name that its host has."""
 
@@ -169,7 +174,8 @@ class RunningWorker:
     def job_process(self):
         """The process of the job at hand."""
         template = self.template()
-        return None if template is None else next(_children(template), None)
+        forks = () if template is None else _children(template)
+        return next(filter(_leads_a_session, forks), None)  # else it runs a program of what the template imports
 
     def template(self):
         """The process that forks those of jobs."""
