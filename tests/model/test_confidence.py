@@ -22,8 +22,10 @@ from ultragray.scene.confidence import (
     ViewMeasures,
     figure_arrays,
     is_confident,
+    predicted,
     require_confidence,
     supported,
+    terms_of,
 )
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -157,6 +159,17 @@ def test_the_formula():
     away = 3.5 - 1.2 * np.log(1.0 + 0.9 / 0.3) - 0.8 * 2.0 / 5.0 - 0.1 * 5.0 / 10.0 - 0.6 * 0.25
     expected = 0.06 + 0.94 / (1.0 + np.exp(-away))
     assert FITTED.predict(measures(2.0, 0.9, 5.0, 0.25)) == pytest.approx([expected])
+
+
+@pytest.mark.parametrize("fitted_to_mm", [2.0, None])
+def test_the_kernel_predicts_by_the_formula_that_is_fitted(fitted_to_mm):
+    rng = np.random.default_rng(0)
+    distance_mm, interpolation_mm, angle_deg = rng.uniform(0.0, 8.0, (3, 5, 36))
+    weights = rng.dirichlet([1.0, 1.0], 5)
+    at = ViewMeasures(distance_mm, distance_mm, interpolation_mm, angle_deg, weights)
+    model = replace(FITTED, support=None, fitted_to_mm=fitted_to_mm)
+    fitted = predicted(np.array(model.weights), terms_of(at, np.array(model.hardness), fitted_to_mm), 0.06)
+    np.testing.assert_allclose(model.predict(at), fitted, rtol=1e-12)
 
 
 def test_distance_beyond_what_it_was_fitted_on_counts_twice():

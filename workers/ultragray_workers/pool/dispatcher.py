@@ -85,7 +85,7 @@ class Assignment:
     def deadline(self) -> float | None:
         """The latest of its steps', in time.monotonic() seconds; None where one has none."""
         deadlines = [step.ticket.request.deadline for step in self.steps.values()]
-        return max(deadlines, default=None) if None not in deadlines else None  # type: ignore[type-var]
+        return max((d for d in deadlines if d is not None), default=None) if None not in deadlines else None
 
 
 class Slot:
