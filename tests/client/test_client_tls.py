@@ -19,13 +19,13 @@ def mounted(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def tls_service(start_shared_service, mounted):
-    return start_shared_service(**mounted.settings())
+def tls_service(start_service, mounted):
+    return start_service(**mounted.settings())
 
 
 @pytest.fixture(scope="module")
-def mutual_service(start_shared_service, mounted):
-    return start_shared_service(**mounted.settings(mutual=True))
+def mutual_service(start_service, mounted):
+    return start_service(**mounted.settings(mutual=True))
 
 
 def test_frames_come_over_tls(tls_service, mounted, make_client):

@@ -22,7 +22,7 @@ from ultragray_client import Client
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
 from ..waiting import Deadline, wait_until
-from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork, pool_processes
+from ..warm import SHORT_WAITS, SOURCE_FOLDERS, WARM, WarmProcess, fork, pool_processes
 
 ROOT = Path(__file__).resolve().parents[2]
 START_TIMEOUT_S = 300.0
@@ -56,6 +56,7 @@ class RunningService:
             "ULTRAGRAY_MAX_QUEUE_MS": "600000",
             "ULTRAGRAY_WORKER_GRACE_S": "600",
             "PYTEST_RUN": self._run,
+            "PYTEST_WAITS": json.dumps(SHORT_WAITS),
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }
         whole = {**os.environ, **settings, **environment}
@@ -201,13 +202,13 @@ def data_folder(tmp_path_factory, demo_scene):
     return folder
 
 
-def service_starter(tmp_path_factory, data_folder):
+def service_starter(tmp_path_factory, data_folder, common_waits=SHORT_WAITS):
     """Starts services with settings as keywords: `start_service(max_image_side=128)`; all are stopped at the end."""
     with ExitStack() as started:
 
         def start(*, wait=True, cold=False, waits=None, **settings):
             environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
-            environment["PYTEST_WAITS"] = json.dumps(waits or {})  # beside SHORT_WAITS
+            environment["PYTEST_WAITS"] = json.dumps({**common_waits, **(waits or {})})
             log_path = tmp_path_factory.mktemp("service") / "log"
             service = started.enter_context(RunningService(data_folder, log_path, environment, cold=cold))
             if wait:
@@ -226,7 +227,7 @@ def start_service(tmp_path_factory, data_folder):
 @pytest.fixture(scope="session")
 def start_shared_service(tmp_path_factory, data_folder):
     """Starts services that live until all tests have ended: for those that tests only read from."""
-    yield from service_starter(tmp_path_factory, data_folder)
+    yield from service_starter(tmp_path_factory, data_folder, common_waits={})
 
 
 @pytest.fixture(scope="module")
