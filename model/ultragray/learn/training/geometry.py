@@ -98,6 +98,7 @@ PIXELS_PER_GAUSSIAN, LEAST_PIXELS = 25, 12  # the latter, of distinct ones, wher
 DIFFERENT_DETAIL, SAME_DETAIL = 0.25, 0.5  # correlation of that of neighbours, up to which and from which on
 STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
 MIN_STEPS, USUAL_STEPS = 250, 1_500  # fewer leave shadows unlearned
+FEWER_STEPS = 750  # tell as much where Gaussians are few for the pixels
 MIN_GAUSSIANS, USUAL_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy; enough unless much more is to be seen
 MAX_GAUSSIANS = 600_000  # of a large volume that is seen finely
 LEAST_LIT = 8  # grey value, of 255, of a pixel that shows something
@@ -147,16 +148,24 @@ class Geometry:
         too. Detail that the next frame does not show is noise for it, and Gaussians that hold it show noise there.
         """
         times = _times(views_between)
-        usual = min(int(times / PIXELS_PER_GAUSSIAN * self.pixel_count), USUAL_GAUSSIANS)
+        usual = min(self._by_pixels(views_between), USUAL_GAUSSIANS)
         detail = DIFFERENT_DETAIL, SAME_DETAIL
         pixels = float(np.interp(self.shared_detail, detail, (PIXELS_PER_GAUSSIAN, LEAST_PIXELS)))
         return max(usual, min(int(times / pixels * self.distinct_pixels), MAX_GAUSSIANS), MIN_GAUSSIANS)
 
     def steps(self, views_between: float) -> int:
-        """By the frames, likewise; more than USUAL_STEPS as the square root of the Gaussians that are more."""
-        times = _times(views_between)
-        most = USUAL_STEPS * math.sqrt(max(1.0, self.gaussian_count(views_between) / USUAL_GAUSSIANS))
+        """By the frames, likewise; more than USUAL_STEPS as the square root of the Gaussians that are more.
+
+        Fewer likewise, down to FEWER_STEPS, where USUAL_GAUSSIANS are less than the pixels would have: each is the mean
+        of what many pixels show, and a step tells it more.
+        """
+        times, count = _times(views_between), self.gaussian_count(views_between)
+        wanted = USUAL_GAUSSIANS if count > USUAL_GAUSSIANS else max(self._by_pixels(views_between), USUAL_GAUSSIANS)
+        most = max(FEWER_STEPS, USUAL_STEPS * math.sqrt(max(count, USUAL_GAUSSIANS) / wanted))
         return min(max(times * STEPS_PER_FRAME * self.frame_count, times * MIN_STEPS), round(most))
+
+    def _by_pixels(self, views_between: float) -> int:
+        return int(_times(views_between) / PIXELS_PER_GAUSSIAN * self.pixel_count)
 
     def least_out_of_plane_mm(self, views_between: float) -> float:
         """Range of the shift that leaves no gap between frames, where no views between them fill it."""

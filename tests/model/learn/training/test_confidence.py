@@ -97,7 +97,7 @@ def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset):
     assert len(part.val) == 0
 
 
-@pytest.mark.parametrize(("steps", "fewer_steps"), [(1_001, 251), (400, 150), (24, 24)])
+@pytest.mark.parametrize(("steps", "fewer_steps"), [(2_001, 501), (400, 375), (24, 24)])
 def test_a_quarter_of_the_steps_and_fewer_gaussians(tiny_dataset, tiny_config, steps, fewer_steps):
     config = tiny_config(steps=steps).resolved(Geometry.of(tiny_dataset()))
     fewer = shorter(config, 0.6)

@@ -207,7 +207,10 @@ def test_a_large_volume_that_is_seen_finely_gets_more_gaussians_and_steps():
     usual = Geometry(
         np.zeros(3), 10.0, 1.0, 0.2, 0.0, 14_000_000, distinct_pixels=0, shared_detail=0.0, frame_count=200
     )
-    assert (usual.gaussian_count(0.5), usual.steps(0.5)) == (150_000, 1_500)
+    assert (usual.gaussian_count(0.5), usual.steps(0.5)) == (150_000, 750)  # they are few for so many pixels
+    less = replace(usual, pixel_count=3_000_000)
+    assert (less.gaussian_count(0.5), less.steps(0.5)) == (150_000, round(1_500 * (150 / 240) ** 0.5))
+    assert replace(usual, pixel_count=1_875_000).steps(0.5) == 1_500
     large = replace(usual, distinct_pixels=12_000_000)
     assert (large.gaussian_count(0.5), large.steps(0.5)) == (600_000, 3_000)
     assert large.gaussian_count(0.0) == 480_000
