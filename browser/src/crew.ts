@@ -5,15 +5,15 @@
  */
 
 import { wantedPlanes, type Library, type Rendered } from "./library.js";
-import { Thread } from "./thread.js";
-import type { LoadRequest } from "./worker.js";
+import { Asker, type Wish } from "./thread.js";
+import type { Answer, LoadRequest } from "./worker.js";
 
 const MOST_WAIT_MS = 3000; // for helpers, whose shares are as large as the first worker's, once that has drawn its own
 const STRIP = 64; // shares of scan lines end at multiples of it, or at the last one (ultragray_draw)
 
 export class Crew {
-  #helpers: Thread[] | undefined; // undefined: no frame was wide enough yet
-  #ready: Thread[] = []; // those that have the scene
+  #helpers: Asker[] | undefined; // undefined: no frame was wide enough yet
+  #ready: Asker[] = []; // those that have the scene
   #settings = new Map<number, string>(); // of views
   #newest: Promise<unknown> = Promise.resolve(); // frame
 
@@ -25,12 +25,12 @@ export class Crew {
 
   prepare(view: number, settings: string): void {
     this.#settings.set(view, settings);
-    for (const thread of this.#ready) prepare(thread, view, settings);
+    for (const helper of this.#ready) prepare(helper, view, settings);
   }
 
   freeView(view: number): void {
     this.#settings.delete(view);
-    for (const thread of this.#ready) thread.ask({ act: "freeView", view }).catch(() => undefined);
+    for (const helper of this.#ready) helper.ask({ act: "freeView", view }).catch(() => undefined);
   }
 
   /** The frame of a pose and a view, `at` in the library, and how many drew it; undefined where there are no helpers for it.
@@ -54,13 +54,13 @@ export class Crew {
     const rows = height * wantedPlanes(plan).filter(Boolean).length;
     const end = (share: number): number => Math.min(width, STRIP * Math.round((share * strips) / (helpers.length + 1)));
     const lines = [0, ...helpers].map((_, share) => ({ first: end(share), end: end(share + 1), floats: rows * (end(share + 1) - end(share)) }));
-    const asked = helpers.map((thread, number) => thread.ask<Float32Array>({ act: "draw", view, pose, ...lines[number + 1]! }).catch(() => undefined));
+    const asked = helpers.map((helper, number) => helper.ask<Float32Array>({ act: "draw", view, pose, ...lines[number + 1]! }).catch(() => undefined));
     const own = this.library.draw(at, pose, lines[0]!);
     let timer;
     const late = new Promise<undefined>((resolve) => (timer = setTimeout(resolve, MOST_WAIT_MS)));
     const drawn = await Promise.all(asked.map((part) => Promise.race([part, late])));
     clearTimeout(timer);
-    helpers.filter((_, number) => !drawn[number]).forEach((thread) => this.#drop(thread));
+    helpers.filter((_, number) => !drawn[number]).forEach((helper) => this.#drop(helper));
     const whole = new Float32Array(rows * width);
     [own, ...drawn].forEach((part, share) => {
       const { first, end } = lines[share]!;
@@ -70,24 +70,33 @@ export class Crew {
     return { ...this.library.finish(at, pose, whole), workers: 1 + drawn.filter(Boolean).length };
   }
 
-  #drop(thread: Thread): void {
-    this.#ready = this.#ready.filter((one) => one !== thread);
-    thread.close();
+  #drop(helper: Asker): void {
+    this.#ready = this.#ready.filter((one) => one !== helper);
+    wish({ dropped: this.#helpers!.indexOf(helper) });
+    helper.end(new Error("the helper was dropped"));
   }
 
   #start(): void {
-    this.#helpers ??= Array.from({ length: this.request.workers - 1 }, () => {
-      const thread = new Thread();
+    if (this.#helpers !== undefined) return;
+    const channels = Array.from({ length: this.request.workers - 1 }, () => new MessageChannel());
+    wish({ helpers: channels.map(({ port2 }) => port2) });
+    this.#helpers = channels.map(({ port1 }) => {
+      const helper = new Asker(port1);
+      port1.onmessage = ({ data }: MessageEvent<Answer>) => helper.take(data);
       const ready = (): void => {
-        for (const [view, settings] of this.#settings) prepare(thread, view, settings);
-        this.#ready.push(thread);
+        for (const [view, settings] of this.#settings) prepare(helper, view, settings);
+        this.#ready.push(helper);
       };
-      thread.ask({ ...this.request, workers: 1 }).then(ready, () => thread.close());
-      return thread;
+      helper.ask({ ...this.request, workers: 1 }).then(ready, () => this.#drop(helper));
+      return helper;
     });
   }
 }
 
-function prepare(thread: Thread, view: number, settings: string): void {
-  thread.ask({ act: "prepare", view, settings }).catch(() => undefined); // the first worker tells what is wrong
+function wish(wanted: Wish): void {
+  postMessage(wanted, { transfer: "helpers" in wanted ? wanted.helpers : [] });
+}
+
+function prepare(helper: Asker, view: number, settings: string): void {
+  helper.ask({ act: "prepare", view, settings }).catch(() => undefined); // the first worker tells what is wrong
 }

@@ -94,7 +94,9 @@ async function done(request: Request, transfer: Transferable[]): Promise<unknown
   }
 }
 
-onmessage = async ({ data: { number, request } }: MessageEvent<{ number: number; request: Request }>) => {
+type Asked = { number: number; request: Request };
+
+async function answer({ number, request }: Asked, asker: { postMessage(answer: Answer, options: StructuredSerializeOptions): void }): Promise<void> {
   const answer: Answer = { number };
   const transfer: Transferable[] = [];
   try {
@@ -102,5 +104,11 @@ onmessage = async ({ data: { number, request } }: MessageEvent<{ number: number;
   } catch (error) {
     answer.problem = error instanceof Error ? error.message : String(error);
   }
-  postMessage(answer, { transfer });
+  asker.postMessage(answer, { transfer });
+}
+
+onmessage = ({ data }: MessageEvent<Asked | { port: MessagePort }>) => {
+  if (!("port" in data)) return void answer(data, self);
+  const { port } = data; // to the worker that this one helps
+  port.onmessage = ({ data }: MessageEvent<Asked>) => void answer(data, port);
 };
