@@ -30,6 +30,7 @@ from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.worker.process import account_of
+from ultragray_workers.pool.template import WORKER
 
 SCENE = "bench"
 IN_FLIGHT = 8
@@ -62,7 +63,7 @@ def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
         with running_server(Path(folder), backend, SCENE) as server:
             doors = [measure(server, poses) for measure in DOORS.values()]
-            return Served(doors, max(_memory_of_children_mb(server.pid), default=0.0))
+            return Served(doors, max(_memory_of_workers_mb(server.pid), default=0.0))
 
 
 @dataclass(frozen=True)
@@ -206,15 +207,17 @@ DOORS: dict[str, Callable[[RunningServer, FloatArray], FrontDoor]] = {
 }
 
 
-def _memory_of_children_mb(pid: int) -> Iterator[float]:
-    """Of each process below one, its resident memory with shared pages counted by share."""
+def _memory_of_workers_mb(pid: int) -> Iterator[float]:
+    """Of each process below one that renders, its resident memory with shared pages counted by share."""
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in children.read_text(encoding="ascii").split():
             with suppress(OSError):
+                if Path(f"/proc/{child}/comm").read_text(encoding="ascii").strip() != WORKER:
+                    yield from _memory_of_workers_mb(int(child))
+                    continue
                 rollup = Path(f"/proc/{child}/smaps_rollup").read_text(encoding="ascii")
                 if match := re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE):
                     yield int(match[1]) / 1024.0
-                yield from _memory_of_children_mb(int(child))
 
 
 COLUMNS = {

@@ -18,6 +18,8 @@ from typing import NoReturn
 from ultragray_workers.pool.channel import Channel
 from ultragray_workers.pool.messages import ForkWorker, Hello
 
+WORKER = "ug-worker"  # name of a process that renders
+
 
 def main(channel_descriptor: int) -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which drains and then hangs up
@@ -47,7 +49,7 @@ def main(channel_descriptor: int) -> NoReturn:
         channel.close()
         channel = Channel.from_descriptor(descriptors[0])  # the others are the worker's board
         if isinstance(request, ForkWorker):
-            _name_process("ug-worker")
+            _name_process(WORKER)
             try:
                 run_worker(channel, request, *descriptors[1:])
             except BaseException:
