@@ -135,6 +135,7 @@ describe("tools in the image", () => {
     assert.deepEqual(await small(page, 44), []);
     await page.getByTestId("tool-seen").scrollIntoViewIfNeeded();
     await picture(page, "tools-touch");
+    await until(() => page.url(), (url) => url.includes("tool1=needle"), "the address does not hold the needle");
     await page.evaluate(() => localStorage.setItem("ultragray.language", "de"));
     await page.reload();
     await page.getByTestId("tool-seen").getByText(/^Spitze: im Bild, \d+,\d mm tief$/).waitFor();
