@@ -116,6 +116,7 @@ def _remove(path: Path, listener: socket.socket) -> None:
 
 MAX_WAITING = 64  # poses of an ordered stream; then its sender waits
 _LATENCIES = 32  # of the newest frames, whose median is expected of the next
+MAX_AGE_S = 60.0  # of a pose that is foretold: of another clock otherwise
 WINDOW = 2  # answers of a latest stream that may wait for the caller: one comes while the other is looked at
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
 
@@ -224,7 +225,9 @@ class PoseExchange:
     def pose(
         self, pose: PoseLike, timeout_s: float | None, measured_ns: int | None
     ) -> rendering_pb2.RenderStreamRequest:
-        """The message of the next pose. Raises InvalidPose."""
+        """The message of the next pose. Raises InvalidPose, and InvalidArgument for a time of another clock."""
+        if measured_ns is not None and self._seen_after_ms is not None:
+            require_own_clock(measured_ns)
         message = rendering_pb2.RenderStreamRequest(
             sequence=self._sequence + 1,
             pose=pose_message(pose),
@@ -297,6 +300,17 @@ class PoseExchange:
         """No frames are asked for any more; those that came stay."""
         if self._memory is not None:
             self._memory.close()
+
+
+def require_own_clock(measured_ns: int) -> None:
+    """Raises InvalidArgument for a time that is not of the last MAX_AGE_S of `time.monotonic_ns()`."""
+    age_s = (time.monotonic_ns() - measured_ns) / 1e9
+    if not -1.0 <= age_s <= MAX_AGE_S:
+        raise InvalidArgument(
+            f"measured_ns must be of time.monotonic_ns(), since seen_after_ms counts from then to now: got a time "
+            f"{abs(age_s):,.0f} s {'ago' if age_s > 0.0 else 'ahead'}",
+            field="measured_ns",
+        )
 
 
 # The answers of a latest stream that have come and wait for the caller.

@@ -84,6 +84,11 @@ def test_frames_are_those_of_when_they_are_seen(client):
         assert stream.receive().prediction is None
     with pytest.raises(errors.InvalidArgument, match="seen_after_ms must be from 0 to 1000, got -1"):
         client.stream("demo", seen_after_ms=-1.0)
+    with client.stream("demo", RenderSettings(height=8, width=8), seen_after_ms=20.0) as stream:
+        for off_s, told in ((-1000.0, "1,000 s ago"), (1e9, "ahead")):
+            with pytest.raises(errors.InvalidArgument, match=told) as caught:
+                stream.send(moved(0.0), measured_ns=time.monotonic_ns() + round(1e9 * off_s))
+            assert caught.value.field == "measured_ns"
 
 
 def test_the_clock_of_the_client_is_told_beside_the_services(client):

@@ -106,9 +106,31 @@ def test_nothing_is_foretold_of_a_first_pose_of_no_time_and_of_poses_that_come_a
     found, told = path.predict(5.05)
     np.testing.assert_array_equal(found, pose)
     assert (told.error_mm, told.error_deg) == (None, None)
-    path.observe(5.0, np.eye(4))  # of the same time, and of one before
-    path.observe(4.0, np.eye(4))
+    path.observe(5.0, pose)
+    path.observe(4.9, np.eye(4))  # a late one
     np.testing.assert_array_equal(path.predict(5.0)[0], pose)
+
+
+@pytest.mark.parametrize("back_s", [0.5, 3600.0, -1e6])
+def test_where_a_clock_is_set_the_path_begins_anew(back_s):
+    """Set forth by one stamp only, which the rest then lie far before."""
+    times = np.arange(0, 3, 0.02)
+    poses, path = hand_at(times), PathPredictor()
+    stamps = times - np.where(times >= 2.0, back_s, 0.0) if back_s > 0.0 else times + 1e6 * (times == times[100])
+    for number, (stamp_s, pose) in enumerate(zip(stamps, poses, strict=True)):
+        path.observe(stamp_s, pose)
+        found, told = path.predict(stamp_s + AHEAD_S)
+        if number == (102 if back_s == 0.5 else 100):  # nothing is known of the motion: the error is that of none
+            np.testing.assert_array_equal(found, pose)
+            assert told.error_mm > 0.5
+    assert rms(found[None], hand_at([times[-1] + AHEAD_S]))[0] < 0.2
+
+
+def test_poses_of_one_time_are_followed():
+    path = PathPredictor()
+    for pose in hand_at(np.arange(0, 1, 0.02)):
+        path.observe(5.0, pose)
+        np.testing.assert_array_equal(path.predict(5.05)[0], pose)
 
 
 @pytest.mark.parametrize("jump", ["of the tracker", "of time"])
