@@ -189,6 +189,26 @@ def test_the_way_is_as_long_as_it_may_be_and_begins_at_the_start() -> None:
     assert plan.path_mm <= 50.0 < free.path_mm
 
 
+@pytest.mark.parametrize("path_mm", [10.0, 40.0, 120.0])
+def test_views_too_far_for_the_way_do_not_keep_others_from_it(path_mm: float) -> None:
+    """Among more poses a plan gains about as much at least as among those of them that lie near the start."""
+    start = SCENE.training_poses[45]
+    asked = PlanSettings(**SMALL | {"path_mm": path_mm, "views": 100})
+    near = np.repeat(start[None], 21, axis=0)
+    near[:, 0, 3] += np.linspace(-20.0, 20.0, 21)
+    far = SCENE.training_poses[[0, 90]].copy()
+    far[:, 0, 3] += 30.0
+    among_near, among_all = (plan_views(SCENE, asked, poses=some, start=start) for some in (near, [*near, *far]))
+    assert among_near.gains.sum() > 0.0
+    assert among_all.gains.sum() > 0.8 * among_near.gains.sum()
+    assert among_all.path_mm <= path_mm
+    for plan in (among_near, among_all):
+        corners = PROBE.corners_from(np.concatenate([start[None], plan.poses]))
+        assert plan.path_mm == pytest.approx(corner_distances_mm(corners[1:], corners[:-1]).sum())
+        assert plan.after - plan.before == pytest.approx(plan.gains.sum())
+        assert sorted(plan.ranks) == list(range(len(plan.poses)))
+
+
 def test_bone_is_looked_at_from_where_it_is_seen() -> None:
     """Behind bone nothing is to be seen from above: a view that looks past it gains more than one through it."""
     label = next(number for number, name in SCENE.info.label_names.items() if name == "bone")
@@ -207,6 +227,8 @@ def test_bone_is_looked_at_from_where_it_is_seen() -> None:
         ({}, {"poses": np.tile(np.eye(4), (5000, 1, 1))}, "poses"),
         ({}, {"start": np.tile(np.eye(4), (2, 1, 1))}, "start"),
         ({}, {"view": np.zeros((4, 4))}, "view"),
+        ({"plane": (0.0, 1.0, 0.0, 1.0)}, {"view": np.eye(4)}, "plane"),
+        ({"box_mm": "500:510,0:5,0:5"}, {"poses": np.eye(4)[None]}, "box_mm"),
     ],
 )
 def test_what_cannot_be_planned_is_told_by_its_field(asked: dict, more: dict, field: str) -> None:
