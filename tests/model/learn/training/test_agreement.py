@@ -141,6 +141,18 @@ def test_no_share_is_taken_that_passes_which_cross_contradict(monkeypatch):
     assert agreed_path(given).shares == RIGID
 
 
+def test_no_share_is_taken_by_which_only_far_frames_are_predicted_better(monkeypatch):
+    given, path = known("following")
+    assert path.shares != RIGID
+    frames_db = agreement._Judge.frames_db
+
+    def only_far(judge, poses, reach=1):
+        return np.full(len(judge.frames), 20.0) if reach == 1 else frames_db(judge, poses, 1)
+
+    monkeypatch.setattr(agreement._Judge, "frames_db", only_far)
+    assert agreed_path(given).shares == RIGID
+
+
 def test_a_few_frames_do_not_tell_of_tissue():
     tracked = hand_path()
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
