@@ -177,24 +177,28 @@ class Tracker:
         self._scene, self._probe = scene, probe
         self._last = None if start is None else _one_start(start)[0]
         self._motion: FloatArray | None = None  # [4, 4], from frame to frame; None: not known
+        self._is_lost = False  # the frame before was not found
 
     def locate(self, image: Any) -> Localization:  # [H, W]
         """The pose of the next frame, looked for where the motion of the last two leads, and about the last one where
-        it is not found there; anywhere after frames that were not found. Raises what localize() raises.
+        it is not found there; anywhere where it is not found there either. After frames that were not found it is
+        looked for both about the last one and anywhere, for the better of the two. Raises what localize() raises.
         """
-        found = None
-        if self._last is not None:
-            if self._motion is not None:
-                found = self._localized(image, self._last @ self._motion, SearchKind.TRACK)
-            if found is None or not found.is_found:
-                found = self._localized(image, self._last, SearchKind.NEAR)
-        if found is None or not found.is_found:
-            found = self._localized(image, None, SearchKind.ANYWHERE)
-        if not found.is_found:
+        tried = []
+        if self._last is not None and self._motion is not None:
+            tried.append(self._localized(image, self._last @ self._motion, SearchKind.TRACK))
+        if self._last is not None and not any(one.is_found for one in tried):
+            tried.append(self._localized(image, self._last, SearchKind.NEAR))
+        if self._is_lost or not any(one.is_found for one in tried):
+            tried.append(self._localized(image, None, SearchKind.ANYWHERE))
+        found = max(tried, key=lambda one: (one.is_found, one.similarity))
+        if found.is_found:
+            is_followed = self._last is not None and not self._is_lost
+            self._motion = np.linalg.inv(self._last) @ found.pose if is_followed else np.eye(4)
+            self._last = found.pose
+        else:
             self._motion = None
-            return found
-        self._motion = np.eye(4) if self._last is None else np.linalg.inv(self._last) @ found.pose
-        self._last = found.pose
+        self._is_lost = not found.is_found
         return found
 
     def _localized(self, image: Any, start: FloatArray | None, search: SearchKind) -> Localization:

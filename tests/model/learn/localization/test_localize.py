@@ -112,6 +112,19 @@ def test_frames_of_a_probe_in_motion_are_tracked(demo, monkeypatch):
     assert asked[5:] == [SearchKind.TRACK, SearchKind.NEAR, SearchKind.ANYWHERE]
 
 
+def test_frames_after_lost_ones_are_found_where_they_are(demo):
+    """The probe goes on meanwhile: about its last place, another is like enough to be taken for the frame's."""
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 1, 3] = -20.0 + 1.5 * np.arange(8)
+    poses[:, 0, 3] = 2.0 * np.sin(poses[:, 1, 3] / 5.0)
+    tracker = Tracker(demo, poses[0])
+    for number, pose in enumerate(poses):
+        is_lost = number in (4, 5)
+        found = tracker.locate(BLACK if is_lost else frame_of(demo, pose))
+        assert found.is_found is not is_lost
+        assert is_lost or is_found(found.pose, pose, demo.info.probe), number
+
+
 def test_a_frame_is_found_from_nowhere(demo):
     """Beside the path: none of the poses of the index is the frame's."""
     probe = demo.info.probe_or(None)
