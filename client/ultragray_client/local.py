@@ -11,6 +11,7 @@ import asyncio
 import socket
 import struct
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -86,6 +87,7 @@ class LocalCall:
         try:
             with self._listener:
                 end, _ = self._listener.accept()
+            weakref.finalize(self, end.close)  # of a stream that is dropped unread
             self._socket = end
             if not self._call.is_active():
                 self._hang_up()

@@ -1,5 +1,6 @@
 """The socket that messages of a stream go through on one host: in pieces, and where nobody reads them."""
 
+import gc
 import socket
 import struct
 import threading
@@ -67,6 +68,26 @@ def test_messages_come_whole_however_they_are_cut(connected):
     threading.Thread(target=send).start()
     for expected, received in zip(sent, call, strict=True):
         assert (received.message.sequence, bytes(received.data)) == (expected.sequence, expected.data)
+
+
+def test_a_call_that_is_dropped_unread_closes_its_socket(tmp_path):
+    """Python would warn of a socket that is left to it."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "socket"))
+    listener.listen(1)
+    opening = iter([rendering_pb2.RenderStreamRequest()])
+    call = LocalCall(lambda first: next(first) and OpenCall(), opening, listener)
+    with socket.socket(socket.AF_UNIX) as end:
+        end.connect(str(tmp_path / "socket"))
+        for thread in threading.enumerate():
+            if thread.name == "ultragray-local":
+                thread.join(10.0)
+        del call, thread
+        gc.collect()
+        end.settimeout(10.0)
+        assert end.recv(1) == b""
+        with pytest.raises(BrokenPipeError):
+            end.send(b"too late")
 
 
 def test_a_message_goes_at_once_unless_nobody_reads(connected):

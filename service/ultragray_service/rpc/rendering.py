@@ -199,11 +199,13 @@ class _Socket:
 
     async def write(self, message: rendering_pb2.Frame | bytes) -> None:
         _, writer = self._ends or await self._opened()
+        if writer.is_closing():  # the client is gone, which ends its call, too
+            return
         data = message if isinstance(message, bytes) else message.SerializeToString()
         try:
             writer.write(_LENGTH.pack(len(data)) + data)
             await writer.drain()
-        except OSError:  # the client is gone, which ends its call, too
+        except OSError:  # likewise
             return
 
     async def _opened(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:

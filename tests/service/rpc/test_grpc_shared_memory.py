@@ -1,5 +1,6 @@
 """Streams whose frames go through memory that the client shares, laid out as rendering.proto says."""
 
+import asyncio
 import errno
 import os
 import secrets
@@ -8,11 +9,13 @@ from pathlib import Path
 
 import grpc
 import pytest
+import uvloop
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.streams import MAX_MESSAGE_BYTES
 from ultragray_service.rpc.calls import address_of
+from ultragray_service.rpc.rendering import _Socket
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 
 from ...file_sizes import files_of_at_most
@@ -154,6 +157,22 @@ def test_a_client_that_is_gone_or_cancels_ends_the_stream(service, renders, memo
         wait_until(lambda: service.metric("ultragray_open_streams") == 0)
         through.close()
         made.close()
+
+
+def test_a_frame_for_a_client_that_is_just_gone_is_no_fault():
+    async def run():
+        end, far = socket.socketpair()
+        with far:
+            through = _Socket(end)
+            _, writer = await through._opened()
+            writer.transport.abort()  # as uvloop does when it finds the client gone
+            await asyncio.sleep(0.01)
+            await through.write(b"a frame")
+            await through.close(at_once=True)
+
+    loop = uvloop.new_event_loop()
+    loop.run_until_complete(run())
+    loop.close()
 
 
 def test_a_socket_that_is_not_there_is_refused(renders, memory):
