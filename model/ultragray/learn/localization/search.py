@@ -193,9 +193,8 @@ class Tracker:
             tried.append(self._localized(image, None, SearchKind.ANYWHERE))
         found = max(tried, key=lambda one: (one.is_found, one.similarity))
         if found.is_found:
-            is_followed = self._last is not None and not self._is_lost
-            self._motion = np.linalg.inv(self._last) @ found.pose if is_followed else np.eye(4)
-            self._last = found.pose
+            before = found.pose if self._last is None or self._is_lost else self._last
+            self._motion, self._last = np.linalg.inv(before) @ found.pose, found.pose
         else:
             self._motion = None
         self._is_lost = not found.is_found
