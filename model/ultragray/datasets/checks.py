@@ -21,6 +21,7 @@ from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_de
 from ultragray.datasets.images import CropBox
 from ultragray.geometry.probe import Fan, FloatArray, Probe
 from ultragray.geometry.rotations import rotation_angles_deg, turns_of
+from ultragray.learn.marks import LEAST_PICTURES, burnt_in
 from ultragray.learn.sweep import REST, Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list, usual_step
 from ultragray.learn.training.agreement import agreed_path
 
@@ -91,14 +92,11 @@ TURN_IN_PLACE_DEG = 5.0
 LONGEST_USUAL_STEP_MM = 50.0
 MAX_TILT_FRAMES = 300
 THUMBNAIL = (32, 32)
-LEAST_PICTURES = 8  # of which changes and marks can be told
 MOST_REPEATS = 3  # of one kind that are told one by one: more in one sentence
 FLAT = 2.0  # levels, standard deviation of a thumbnail: below, it is black or noise, and its looks say little
 CUT_FACTOR, SMALLEST_CUT = 8.0, 0.15  # of one minus the correlation of two pictures
-STILL, BRIGHT = 6, 40  # levels: JPEG keeps text so
-LEAST_MARKS, LEAST_ALIVE, MAX_BOXES = 12, 0.2, 3
+LEAST_MARKS, MAX_BOXES = 12, 3
 MARGIN = 2  # pixels around marks whose edges are smoothed
-MARK_CONTRAST = 2.0  # to the darkest of the pixels around: the bright band below a probe's face has less
 
 
 @dataclass(frozen=True)
@@ -428,28 +426,12 @@ def _overlays(frames: _Frames) -> Iterator[str]:
 
 def overlay_boxes(images: Iterable[np.ndarray], count: int) -> list[CropBox]:
     """Where images show the same bright marks while the rest of them changes, the largest first."""
-    if count < LEAST_PICTURES:
-        return []
-    low = high = None
-    for image in images:
-        low = image.copy() if low is None else np.minimum(low, image, out=low)
-        high = image.copy() if high is None else np.maximum(high, image, out=high)
-    if low is None or high is None:
-        return []
-    is_still = high.astype(np.int16) - low <= STILL
-    marks = is_still & (low >= BRIGHT)
-    alive = np.mean(high[~marks].astype(np.int16) - low[~marks] > 2 * STILL) if not marks.all() else 0.0
-    if alive < LEAST_ALIVE or marks.sum() < LEAST_MARKS:
-        return []
-    grown = cv2.dilate(marks.astype(np.uint8), np.ones((5, 9), np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
     boxes = []
-    for label in range(1, len(stats)):
-        rows, columns = np.nonzero(marks & (labels == label))
-        if len(rows) >= LEAST_MARKS and _stands_out(marks & (labels == label), marks, low):
-            box = CropBox(int(columns.min()), int(columns.max()) + 1, int(rows.min()), int(rows.max()) + 1)
-            boxes.append((len(rows), box))
-    return [box for _, box in sorted(boxes, key=lambda one: -one[0])]
+    for mark in burnt_in(images, count):
+        rows, columns = np.nonzero(mark)
+        if len(rows) >= LEAST_MARKS:
+            boxes.append(CropBox(int(columns.min()), int(columns.max()) + 1, int(rows.min()), int(rows.max()) + 1))
+    return boxes
 
 
 def without_names(dataset: Dataset) -> tuple[Dataset, int]:
@@ -466,11 +448,6 @@ def without_names(dataset: Dataset) -> tuple[Dataset, int]:
             images[:, top : box.bottom + MARGIN, left : box.right + MARGIN] = 0
         parts.append(replace(part, images=images))
     return Dataset("anonymous", *parts), len(boxes)
-
-
-def _stands_out(mark: np.ndarray, marks: np.ndarray, low: np.ndarray) -> bool:
-    around = (cv2.dilate(mark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~marks
-    return not around.any() or float(low[mark].mean()) >= MARK_CONTRAST * float(np.median(low[around]))
 
 
 def _dataset_warnings(dataset: Dataset, path: PathReport | None) -> list[str]:

@@ -29,11 +29,13 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
 
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import blended, mean_axes, rotations_of, transforms_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_sharply
+from ultragray.learn.marks import burnt_in
 from ultragray.learn.prediction import blend_by_distance, blend_in_time, frame_times, seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
 from ultragray.learn.training.alignment import (
@@ -63,6 +65,7 @@ FAR = 4  # frames away from the one that is predicted
 LEAST_PREDICTED = 8  # frames: fewer may fit any shares, and an even path, by chance
 CROSSING_FRAMES, CROSSING_PIXELS = 48, 512  # that are looked at in other passes, of each
 CROSSING_MM = 1.0  # of a pixel from a frame of another pass: it shows the same
+MARK_MARGIN = 5  # pixels, odd: what is burnt in shines upon those beside it
 LEAST_CROSSING = 1000  # pixels that other passes show: fewer say little
 
 Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
@@ -314,6 +317,7 @@ class _Judge:
     frames: IntArray  # [P] their places
     far: IntArray  # [Q] those that have frames FAR before and behind them
     passes: IntArray  # [F] the pass of each frame
+    marks: Sweep | None  # one picture, bright about what is burnt into all images; None: nothing is
     _known_points: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, init=False)
 
     @classmethod
@@ -325,7 +329,7 @@ class _Judge:
             return None
         passes = np.repeat(np.arange(len(ranges)), [len(some) for some in ranges])
         frames, far = (some[spread_places(len(some), FRAMES)] for some in (frames, far))
-        return cls(sweep, frames, far, passes)
+        return cls(sweep, frames, far, passes, _marks_of(sweep))
 
     def psnr_db(self, poses: FloatArray, reach: int = 1) -> float:  # [F, 4, 4] mm
         """The mean of `frames_db`."""
@@ -351,6 +355,8 @@ class _Judge:
             points = local @ onto[:3, :3].T + onto[:3, 3]
             inside, values[side, inside] = seen_by_frame(self.sweep, beside, points, interpolated_sharply)
             distances[side, inside] = np.abs(points[inside, 1])
+            if self.marks is not None:
+                distances[side, np.flatnonzero(inside)[seen_by_frame(self.marks, 0, points)[1] > 0.0]] = np.inf
         predicted = blend_by_distance(values, distances)
         known = ~np.isnan(predicted)
         return _psnr_db(predicted[known], shown[known])
@@ -396,12 +402,26 @@ class _Judge:
         return self._known_points[frame]
 
     def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns
+        """Beside marks."""
         random = np.random.default_rng(frame)
-        return random.integers(self.sweep.height, size=PIXELS), random.integers(self.sweep.width, size=PIXELS)
+        rows, columns = (random.integers(size, size=PIXELS) for size in self.sweep.images.shape[1:])
+        if self.marks is None:
+            return rows, columns
+        beside = self.marks.images[0, rows, columns] == 0
+        return rows[beside], columns[beside]
 
     def _shown(self, frame: int, rows: IntArray, columns: IntArray) -> FloatArray:  # [N]
         shown: FloatArray = self.sweep.images[frame, rows, columns].astype(np.float64)
         return shown
+
+
+def _marks_of(sweep: Sweep) -> Sweep | None:
+    """What is burnt into all images, such as text, as one picture of a sweep: it says that nothing moves."""
+    marks = burnt_in(sweep.images, len(sweep))
+    if not marks:
+        return None
+    grown = cv2.dilate(255 * np.any(marks, axis=0).astype(np.uint8), np.ones((MARK_MARGIN, MARK_MARGIN), np.uint8))
+    return replace(sweep.select([0]), images=grown[None])
 
 
 def _psnr_db(predicted: FloatArray, true: FloatArray) -> float:  # [N] of 255, both; none: 0 dB

@@ -141,6 +141,19 @@ def test_no_share_is_taken_that_passes_which_cross_contradict(monkeypatch):
     assert agreed_path(given).shares == RIGID
 
 
+def test_text_that_is_burnt_in_tells_nothing_of_tissue(monkeypatch):
+    given, path = known("exact")
+    rows, columns = np.mgrid[: given.train.height, : given.train.width]
+    text = (rows % 6 < 3) & (columns % 6 < 3) & (rows < 30)
+    parts = [
+        replace(part, images=np.where(text, 230, part.images).astype(np.uint8)) for part in (given.train, given.val)
+    ]
+    written = replace(given, train=parts[0], val=parts[1])
+    assert path.shares == agreed_path(written).shares == RIGID
+    monkeypatch.setattr(agreement, "_marks_of", lambda sweep: None)
+    assert agreed_path(written).shares != RIGID  # it would
+
+
 def test_no_share_is_taken_by_which_only_far_frames_are_predicted_better(monkeypatch):
     given, path = known("following")
     assert path.shares != RIGID
