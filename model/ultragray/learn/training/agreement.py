@@ -421,7 +421,7 @@ def _marks_of(sweep: Sweep) -> Sweep | None:
     if not marks:
         return None
     grown = cv2.dilate(255 * np.any(marks, axis=0).astype(np.uint8), np.ones((MARK_MARGIN, MARK_MARGIN), np.uint8))
-    return replace(sweep.select([0]), images=grown[None])
+    return replace(sweep.select([0]), images=grown[None].astype(np.uint8))
 
 
 def _psnr_db(predicted: FloatArray, true: FloatArray) -> float:  # [N] of 255, both; none: 0 dB
