@@ -12,6 +12,7 @@ The format is LeRobot's 3.0, frames as PNG files within the tables. A folder hol
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,8 +91,11 @@ def rollout(env: Any, act: Callable[[Any, dict[str, Any]], Any], task: str, seed
 def write_lerobot(folder: Path, episodes: Sequence[Episode], *, fps: int = 25, robot: str = "ultrasound probe") -> None:
     """Writes a data set of episodes into a new folder; frames and actions are alike in all of them.
 
-    Raises InvalidArgument where there is none, where shapes differ, and where the folder exists.
+    Raises InvalidArgument where there is none, where shapes differ, where the folder exists, and for an `fps` of 0 or
+    less.
     """
+    if not (math.isfinite(fps) and fps > 0):
+        raise InvalidArgument(f"fps must be greater than 0, got {fps}", field="fps")
     if folder.exists():
         raise InvalidArgument(f"folder must not exist yet, got {str(folder)!r}", field="folder")
     shapes = {(one.frames.shape[1:], one.actions.shape[1:]) for one in episodes}

@@ -70,6 +70,11 @@ class ScanSettings(Contract):
         LowConfidence.PENALTY,
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_confidence is None and self.low_confidence is LowConfidence.MASK:
+            raise InvalidArgument("low_confidence mask needs min_confidence", field="min_confidence")
+
     @property
     def reach_mm(self) -> float:
         """The farthest that the probe gets from where its task is."""

@@ -4,6 +4,7 @@ The package itself is not among the test's: its releases ask for an older torch.
 """
 
 import json
+import math
 from dataclasses import replace
 
 import gymnasium
@@ -71,6 +72,9 @@ def test_mistakes_are_told(episodes, env, tmp_path):
         read_lerobot(tmp_path / "old")
     with pytest.raises(InvalidArgument, match="holds no LeRobot data set"):
         read_lerobot(tmp_path / "none")
+    for fps in (0, -5, math.nan):
+        with pytest.raises(InvalidArgument, match="fps must be greater than 0"):
+            write_lerobot(tmp_path / "new", episodes, fps=fps)
     with pytest.raises(InvalidArgument, match="folder must not exist yet"):
         write_lerobot(tmp_path / "old", episodes)
     with pytest.raises(InvalidArgument, match="got 0 kinds of them"):

@@ -15,7 +15,7 @@ from ultragray.phantom.demo import load_demo_scene
 from ultragray.rendering.tools import Needle
 from ultragray.scene.confidence import Assessor
 from ultragray_studies.gym import ENVIRONMENTS, STANDARD_PLANE, TaskName, UltragrayEnv, UltragrayVectorEnv
-from ultragray_studies.gym.scan import moved
+from ultragray_studies.gym.scan import ScanSettings, moved
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 SMALL = {"height": 24, "width": 20, "start_mm": 4.0, "start_deg": 5.0}
@@ -173,6 +173,11 @@ def test_a_needle_reaches_the_vessel(demo):
     assert np.abs(frames[0].astype(int) - without[0]).max() > 50  # the needle is seen
     np.testing.assert_array_equal(frames[1], without[1])
     assert all(isinstance(tool, Needle) for (tool,) in env.tasks[0].tools(np.ones(2, bool)))
+
+
+def test_a_mask_needs_a_least_confidence():
+    with pytest.raises(InvalidArgument, match="needs min_confidence"):
+        ScanSettings(low_confidence="mask")
 
 
 def test_low_confidence_is_a_penalty_or_a_mask(demo):
