@@ -82,6 +82,19 @@ def test_positions_in_millimetres_where_metres_are_expected_are_named(make_sweep
     )
 
 
+def test_what_comes_of_wrong_units_is_not_told_to_come_of_tissue(make_sweep):
+    poses = make_sweep(30).poses
+    poses[:, 0, 3] += 3.0 * np.sin(np.arange(30) / 3.0)
+    told = []
+    for unit in (1.0, 1000.0):
+        poses[:, :3, 3] *= unit
+        sweep = make_sweep(30, images=moving_texture(30), poses=poses)
+        report = check_dataset(Dataset("one", sweep, sweep.select([])))
+        assert "tissue" in report.path.causes
+        told.append([text for text in report.warnings if "tissue" in text])
+    assert [len(texts) for texts in told] == [1, 0]
+
+
 def moving_texture(count=20):  # [count, 96, 128]
     """Texture that changes slowly from frame to frame."""
     random = np.random.default_rng(1)
