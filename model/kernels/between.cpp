@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 #include "threads.hpp"
@@ -118,6 +119,55 @@ void blend_between(const uint8_t* images, int height, int width, const int64_t* 
                      }
                  }};
     run_phases({&planes}, threads);
+}
+
+void interpolate_planes(const uint8_t* images, int height, int width, const double* image_poses, const double* poses,
+                        const int64_t* frames, int count, int most, const FrameLines& lines, int threads, float* planes) {
+    const int64_t size = int64_t(height) * width;
+    const float *xs = lines.pixels, *zs = lines.pixels + size;
+    Phase each{count, [&](int c) {
+                   std::vector<float> row(5 * width), grey(2 * size);
+                   std::vector<float> distances(2 * size, std::numeric_limits<float>::infinity());
+                   float *heights = row.data(), *values = heights + width, *weights = values + width;
+                   float *places = weights + width, *above = distances.data(), *below = above + size;
+                   for (int k = 0; k < most && frames[int64_t(c) * most + k] >= 0; ++k) {
+                       const int64_t frame = frames[int64_t(c) * most + k];
+                       const double *from = poses + 16 * c, *to = image_poses + 16 * frame;
+                       float onto[9];
+                       for (int d = 0; d < 3; ++d) {
+                           double by_x = 0, by_z = 0, shift = 0;
+                           for (int e = 0; e < 3; ++e) {
+                               const double axis = to[4 * e + d];
+                               by_x += axis * from[4 * e], by_z += axis * from[4 * e + 2];
+                               shift += axis * (from[4 * e + 3] - to[4 * e + 3]);
+                           }
+                           onto[3 * d] = float(by_x), onto[3 * d + 1] = float(by_z), onto[3 * d + 2] = float(shift);
+                       }
+                       for (int64_t at = 0; at < size; at += width) {
+                           int nearer = 0;
+                           for (int j = 0; j < width; ++j) {
+                               const float y = onto[3] * xs[at + j] + onto[4] * zs[at + j] + onto[5];
+                               heights[j] = y;
+                               nearer |= int(y >= 0 && y < above[at + j]) | int(y <= 0 && -y < below[at + j]);
+                           }
+                           if (!nearer) continue;
+                           project(images + frame * size, height, width, onto, lines, at, places, values, weights);
+                           for (int j = 0; j < width; ++j) {
+                               if (!(weights[j] > 0)) continue;
+                               const float y = heights[j];
+                               if (y >= 0 && y < above[at + j]) above[at + j] = y, grey[at + j] = values[j];
+                               if (y <= 0 && -y < below[at + j]) below[at + j] = -y, grey[size + at + j] = values[j];
+                           }
+                       }
+                   }
+                   for (int64_t at = 0; at < size; ++at) {
+                       const float by_above = 1.0f / std::max(above[at], lines.least_mm);
+                       const float by_below = 1.0f / std::max(below[at], lines.least_mm);
+                       const float both = by_above + by_below;
+                       planes[c * size + at] = both > 0 ? (by_above * grey[at] + by_below * grey[size + at]) / both : 0.0f;
+                   }
+               }};
+    run_phases({&each}, threads);
 }
 
 }  // namespace ultragray

@@ -1,4 +1,4 @@
-// Planes between two frames each, as the training expects them.
+// Planes as the frames beside them say that they look.
 #pragma once
 
 #include <cstdint>
@@ -10,8 +10,8 @@ struct FrameLines {
     bool fanned, wrap;       // lines fan out from the origin, all the way round
     float along_x, along_z;  // the direction of parallel lines
     float start, span, near, length;
-    const float* pixels;  // [2, H W] x and z of each pixel in its own frame
     float least_mm;       // distances from a frame are at least that
+    const float* pixels;  // [2, H W] x and z of each pixel in its own frame
 };
 
 struct Doubt {
@@ -27,5 +27,11 @@ struct Doubt {
 void blend_between(const uint8_t* images, int height, int width, const int64_t* frames, int count, const float* shares,
                    const float* onto, const FrameLines& lines, const Doubt& doubt, int threads, float* blends,
                    float* weights);
+
+// For each of C poses, [C, H, W]: each pixel from the nearest frame on either side of it, weighted by the inverse of their
+// distances; 0 where no frame shows it. `frames` [C, K] are places among the images, of equally near ones the first counts;
+// -1 stands behind the last. Poses, of images and of planes, are [4, 4] in mm.
+void interpolate_planes(const uint8_t* images, int height, int width, const double* image_poses, const double* poses,
+                        const int64_t* frames, int count, int most, const FrameLines& lines, int threads, float* planes);
 
 }  // namespace ultragray

@@ -41,6 +41,7 @@ using Cells = nb::ndarray<const int32_t, nb::ndim<3>, nb::c_contig, nb::device::
 using Offsets = nb::ndarray<const int32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using GreyImages = nb::ndarray<const uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Pairs = nb::ndarray<const int64_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Places = nb::ndarray<const int64_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using PairsOfMaps = nb::ndarray<const float, nb::shape<-1, 2, 3, 3>, nb::c_contig, nb::device::cpu>;
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
@@ -85,6 +86,12 @@ Displacements displacements_of(const FieldArrays& arrays, size_t count) {
                          centre_mm});
     }
     return found;
+}
+
+using LineNumbers = std::tuple<bool, bool, float, float, float, float, float, float, float>;  // of FrameLines
+
+FrameLines lines_of(const LineNumbers& numbers, const float* pixels) {
+    return std::apply([&](auto... number) { return FrameLines{number..., pixels}; }, numbers);
 }
 
 Beam beam_of(const BeamNumbers& numbers) { return {numbers[0], numbers[1], numbers[2], numbers[3]}; }
@@ -330,8 +337,8 @@ NB_MODULE(_cpu, m) {
     m.def(
         "blend_between",
         [](GreyImages images, Pairs frames, Vector shares, std::optional<PairsOfMaps> onto, std::optional<Matrix> pixels,
-           bool fanned, bool wrap, float along_x, float along_z, float start, float span, float near_mm, float length_mm,
-           float least_mm, int smoothed, float doubtful, float nothing, int threads, FreePlanes blends, FreePlanes weights) {
+           const LineNumbers& lines, int smoothed, float doubtful, float nothing, int threads, FreePlanes blends,
+           FreePlanes weights) {
             const size_t count = frames.shape(0), height = images.shape(1), width = images.shape(2);
             if (shares.shape(0) != count || (onto && onto->shape(0) != count) || onto.has_value() != pixels.has_value() ||
                 (pixels && (pixels->shape(0) != 2 || pixels->shape(1) != height * width)))
@@ -342,19 +349,35 @@ NB_MODULE(_cpu, m) {
             for (size_t k = 0; k < 2 * count; ++k)
                 if (frames.data()[k] < 0 || frames.data()[k] >= int64_t(images.shape(0)))
                     throw std::invalid_argument("there is no such frame");
-            const FrameLines lines{
-                fanned,  wrap, along_x, along_z, start, span, near_mm, length_mm, pixels ? pixels->data() : nullptr,
-                least_mm};
+            const FrameLines on_frame = lines_of(lines, pixels ? pixels->data() : nullptr);
             nb::gil_scoped_release release;
             blend_between(images.data(), int(height), int(width), frames.data(), int(count), shares.data(),
-                          onto ? onto->data() : nullptr, lines, {smoothed, doubtful, nothing}, threads, blends.data(),
+                          onto ? onto->data() : nullptr, on_frame, {smoothed, doubtful, nothing}, threads, blends.data(),
                           weights.data());
         },
         nb::arg("images").noconvert(), nb::arg("frames").noconvert(), nb::arg("shares").noconvert(),
-        nb::arg("onto").noconvert().none(), nb::arg("pixels").noconvert().none(), nb::arg("fanned"), nb::arg("wrap"),
-        nb::arg("along_x"), nb::arg("along_z"), nb::arg("start"), nb::arg("span"), nb::arg("near_mm"), nb::arg("length_mm"),
-        nb::arg("least_mm"), nb::arg("smoothed"), nb::arg("doubtful"), nb::arg("nothing"), nb::arg("threads"),
-        nb::arg("blends").noconvert(), nb::arg("weights").noconvert());
+        nb::arg("onto").noconvert().none(), nb::arg("pixels").noconvert().none(), nb::arg("lines"), nb::arg("smoothed"),
+        nb::arg("doubtful"), nb::arg("nothing"), nb::arg("threads"), nb::arg("blends").noconvert(),
+        nb::arg("weights").noconvert());
+
+    m.def(
+        "interpolate_planes",
+        [](GreyImages images, Poses image_poses, Poses poses, Places frames, Matrix pixels, const LineNumbers& lines,
+           int threads, FreePlanes planes) {
+            const size_t count = poses.shape(0), height = images.shape(1), width = images.shape(2);
+            if (image_poses.shape(0) != images.shape(0) || frames.shape(0) != count || pixels.shape(0) != 2 ||
+                pixels.shape(1) != height * width || planes.shape(0) != count || planes.shape(1) != height ||
+                planes.shape(2) != width)
+                throw std::invalid_argument("the shapes of images, poses, frames, pixels and planes do not agree");
+            for (size_t k = 0; k < frames.size(); ++k)
+                if (frames.data()[k] >= int64_t(images.shape(0))) throw std::invalid_argument("there is no such frame");
+            nb::gil_scoped_release release;
+            interpolate_planes(images.data(), int(height), int(width), image_poses.data(), poses.data(), frames.data(),
+                               int(count), int(frames.shape(1)), lines_of(lines, pixels.data()), threads, planes.data());
+        },
+        nb::arg("images").noconvert(), nb::arg("image_poses").noconvert(), nb::arg("poses").noconvert(),
+        nb::arg("frames").noconvert(), nb::arg("pixels").noconvert(), nb::arg("lines"), nb::arg("threads"),
+        nb::arg("planes").noconvert());
 
     m.def("stiffness_kpa", &stiffness_kpa, nb::arg("label"));
 

@@ -41,6 +41,8 @@ describe("contact with the skin", () => {
     await until(() => share(page).textContent(), (text) => text === "100 %", "a view of the sweep has no contact");
 
     await choice(page).selectOption({ label: "Contact assumed" });
+    await page.reload();
+    await until(() => choice(page).inputValue(), (value) => value !== "air", "a reload right after a change undid it");
     await share(page).waitFor({ state: "detached" });
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });

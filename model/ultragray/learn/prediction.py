@@ -12,11 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import DatasetInvalid
-from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.probe import FloatArray, ParallelLines, Probe
 from ultragray.geometry.scan_conversion import Interpolate, interpolated_frames, pixel_places
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, frame_list
 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
+
+
+def line_numbers(probe: Probe) -> tuple[bool | float, ...]:
+    """How the C++ kernels find a point on a frame: `FrameLines` without its pixels."""
+    lines = probe.lines
+    along = lines.direction if isinstance(lines, ParallelLines) else (0.0, 1.0)
+    ends = lines.start, lines.span, probe.near_mm, probe.scan_line_length_mm
+    return not isinstance(lines, ParallelLines), lines.wrap, *along, *ends, ON_PLANE_MM
 
 
 def seen_by_frame(

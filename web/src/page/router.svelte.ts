@@ -30,6 +30,7 @@ class Router {
   /** How often the person came to an address by another way than the page itself: a view reads `kept` anew then. */
   arrivals = $state(0);
   #seen = location.hash;
+  #writtenAt = -WRITTEN_EVERY_MS; // of performance.now()
   #timer: ReturnType<typeof setTimeout> | undefined;
 
   constructor() {
@@ -46,8 +47,13 @@ class Router {
     const present = Object.fromEntries(Object.entries(kept).filter(([, value]) => value !== null)) as Kept;
     if (entry) this.#write();
     this.#address = { ...this.#address, kept: present };
-    if (entry) history.pushState(null, "", (this.#seen = this.link));
-    else this.#timer ??= setTimeout(() => this.#write(), WRITTEN_EVERY_MS);
+    if (entry) {
+      history.pushState(null, "", (this.#seen = this.link));
+      return;
+    }
+    const wait_ms = this.#writtenAt + WRITTEN_EVERY_MS - performance.now();
+    this.#timer ??= setTimeout(() => this.#write(), wait_ms);
+    if (wait_ms <= 0) this.#write(); // at once: the page may be loaded anew before a timer comes
   }
 
   /** The address of what is shown, as a part of the page's. */
@@ -61,6 +67,7 @@ class Router {
     if (this.#timer === undefined) return;
     clearTimeout(this.#timer);
     this.#timer = undefined;
+    this.#writtenAt = performance.now();
     history.replaceState(null, "", (this.#seen = this.link));
   }
 

@@ -20,12 +20,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ultragray import _cpu
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import mean_axes
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
-from ultragray.learn.prediction import NeighboursInTime, blend_by_distance, seen_by_frame
+from ultragray.learn.prediction import NeighboursInTime, line_numbers
 from ultragray.learn.sweep import (
     ByteArray,
     Dataset,
@@ -263,33 +264,26 @@ def evaluate_baselines(
     }
 
 
-def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H, W] in [0, 1]
-    """Each pixel from the nearest frame on either side of it, by the distances to their planes.
+def interpolate_planes(sweep: Sweep, poses: FloatArray, frames: IntArray | None = None) -> FrameArray:
+    """Each pixel [C, H, W], in [0, 1], from the nearest frame on either side of it, by the distances to their planes.
 
     A pixel is projected onto a frame along the frame's normal and counts where it falls into the image. With a frame on
-    one side only it takes that, with none it is 0.
+    one side only it takes that, with none it is 0. `frames` [C, K] are those that each pose is predicted from, the ones
+    before -1 where there are fewer; None: all of them.
     """
+    if frames is None:
+        asked = sweep.probe.corners_from(poses)
+        frames = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)
     points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
-    asked = sweep.probe.corners_from(poses)
-    order = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)  # [C, F]
-    planes = np.zeros((len(poses), sweep.height, sweep.width), np.float32)
-    for plane, pose, frames in zip(planes, check_poses(poses), order, strict=True):
-        plane[:] = _between(sweep, points @ pose[:3, :3].T + pose[:3, 3], frames).reshape(plane.shape)
+    planes = np.empty((len(poses), sweep.height, sweep.width), np.float32)
+    _cpu.interpolate_planes(
+        images=np.ascontiguousarray(sweep.images),
+        image_poses=np.ascontiguousarray(sweep.poses),
+        poses=np.ascontiguousarray(check_poses(poses)),
+        frames=np.ascontiguousarray(frames),
+        pixels=np.ascontiguousarray(points[:, ::2].T, np.float32),
+        lines=line_numbers(sweep.probe),
+        threads=torch.get_num_threads(),
+        planes=planes,
+    )
     return planes
-
-
-def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray:  # [P, 3] mm, [F] -> [P]
-    sides = 2
-    distances = np.full((sides, len(points)), np.inf)
-    values = np.zeros((sides, len(points)))
-    for frame in frames:
-        pose = sweep.poses[frame]
-        elevation = points @ pose[:3, 1] - pose[:3, 3] @ pose[:3, 1]
-        for side in range(sides):
-            height = elevation if side == 0 else -elevation
-            nearer = np.flatnonzero((height >= 0) & (height < distances[side]))
-            if len(nearer):
-                inside, seen = seen_by_frame(sweep, frame, (points[nearer] - pose[:3, 3]) @ pose[:3, :3])
-                distances[side, nearer[inside]] = height[nearer[inside]]
-                values[side, nearer[inside]] = seen
-    return np.nan_to_num(blend_by_distance(values, distances)) / 255.0

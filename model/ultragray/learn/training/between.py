@@ -16,6 +16,7 @@ from torch.nn import functional
 from ultragray import _cpu
 from ultragray.geometry.probe import FloatArray, Lines, ParallelLines, Probe
 from ultragray.geometry.rotations import blended, rotation_angles_deg
+from ultragray.learn.prediction import ON_PLANE_MM, line_numbers
 from ultragray.learn.sweep import IntArray, Sweep, spread_places
 from ultragray.rendering.backends import cuda
 
@@ -110,9 +111,6 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         nearest_mm=min(spacing_mm or max(sweep.pixel_mm), extent_mm),
         extent_mm=extent_mm,
     )
-
-
-ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 
 
 class Blend(NamedTuple):
@@ -298,29 +296,19 @@ class ViewsBetween:
 
     def shown(self, places: Places, poses: FloatArray) -> tuple[Tensor, Tensor]:  # [V, H, W] both
         """The same by the C++ kernel, for images on the CPU."""
-        sweep, lines = self._sweep, self._sweep.probe.lines
-        onto, pixels = None, None
+        sweep, onto, pixels = self._sweep, None, None
         if not self.follow_probe:
             maps = _maps(sweep.poses[places.frames].reshape(-1, 4, 4), np.repeat(poses, 2, axis=0))
             onto = maps.reshape(-1, 2, 3, 3).astype(np.float32)
             pixels = _pixels(sweep.probe, sweep.height, sweep.width, self._images.device)[:2].numpy()
         images, weights = torch.empty((2, len(poses), sweep.height, sweep.width))
-        along_x, along_z = lines.direction if isinstance(lines, ParallelLines) else (0.0, 1.0)
         _cpu.blend_between(
             images=self._images.numpy(),
             frames=places.frames,
             shares=places.shares.astype(np.float32),
             onto=onto,
             pixels=pixels,
-            fanned=not isinstance(lines, ParallelLines),
-            wrap=lines.wrap,
-            along_x=along_x,
-            along_z=along_z,
-            start=lines.start,
-            span=lines.span,
-            near_mm=sweep.probe.near_mm,
-            length_mm=sweep.probe.scan_line_length_mm,
-            least_mm=ON_PLANE_MM,
+            lines=line_numbers(sweep.probe),
             smoothed=SMOOTHED,
             doubtful=DOUBTFUL,
             nothing=EXACT,

@@ -27,7 +27,7 @@ from torch.nn import functional
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.evaluation import metrics
-from ultragray.learn.evaluation.baselines import FrameArray, interpolate_planes
+from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep, rendered_parts
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
@@ -136,17 +136,19 @@ class Neighbours:
         order = np.argsort(self._distances_mm[row], kind="stable")
         return tuple(order[among[order]][:MOST_HELPERS].tolist())
 
-    def predict(self, row: int, helpers: tuple[int, ...]) -> tuple[FrameArray, ViewMeasures]:  # [h, w] in [0, 1]
-        """A small picture of a target, and how its pose lies to its helpers."""
-        some, target = self._small.select(list(helpers)), self.targets[row]
-        pose = self._small.poses[target : target + 1]
-        measures = TrainingViews(some.poses, some.probe).measure(pose, some.probe)
-        return interpolate_planes(some, pose)[0], measures
-
-    def scores(self, rows: Sequence[int], pictures: Sequence[FrameArray]) -> list[float]:
-        """The MS-SSIM of small pictures of targets."""
-        truth = torch.from_numpy(self._small.images[self.targets[list(rows)]]).float().div_(255.0)
-        return metrics.ms_ssim(torch.from_numpy(np.stack(pictures)), truth)
+    def predict(self, rows: Sequence[int], helpers: Sequence[tuple[int, ...]]) -> list[tuple[float, ViewMeasures]]:
+        """The MS-SSIM of small pictures of targets, each made from its helpers, and how its pose lies to those."""
+        small, targets = self._small, self.targets[list(rows)]
+        frames = np.full((len(rows), MOST_HELPERS), -1)
+        for some, of in zip(frames, helpers, strict=True):
+            some[: len(of)] = of
+        pictures = torch.from_numpy(interpolate_planes(small, small.poses[targets], frames))
+        truth = torch.from_numpy(small.images[targets]).float().div_(255.0)
+        measures = [
+            TrainingViews(small.poses[list(of)], small.probe).measure(small.poses[[target]], small.probe)
+            for target, of in zip(targets, helpers, strict=True)
+        ]
+        return list(zip(metrics.ms_ssim(pictures, truth), measures, strict=True))
 
 
 def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
@@ -159,7 +161,7 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
 
 
 MOST_TARGETS = 192  # frames that are predicted
-SCORED_AT_ONCE = 64  # predictions: one by one, torch's threads took most of the time to find each other
+PREDICTED_AT_ONCE = 64  # one by one, threads took most of the time to find each other
 BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
 
 
@@ -177,12 +179,11 @@ def one_sided(sweep: Sweep) -> list[Prediction]:
                 (row, helpers, not number) for number, helpers in enumerate(dict.fromkeys(choices)) if len(helpers) > 1
             ]
     found = []
-    for first in range(0, len(asked), SCORED_AT_ONCE):
-        rows, helpers, nearest = zip(*asked[first : first + SCORED_AT_ONCE], strict=True)
-        pictures, measures = zip(*map(neighbours.predict, rows, helpers), strict=True)
-        scores = neighbours.scores(rows, pictures)
+    for first in range(0, len(asked), PREDICTED_AT_ONCE):
+        rows, helpers, nearest = zip(*asked[first : first + PREDICTED_AT_ONCE], strict=True)
         targets = neighbours.targets[list(rows)].tolist()
-        found += [Prediction(*one) for one in zip(targets, nearest, scores, measures, strict=True)]
+        for target, is_nearest, told in zip(targets, nearest, neighbours.predict(rows, helpers), strict=True):
+            found.append(Prediction(target, is_nearest, *told))
     return found
 
 

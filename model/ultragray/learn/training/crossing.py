@@ -168,12 +168,11 @@ class _Crossing:
         normal, right = np.eye(size) / USUAL_MM**2, -coefficients.reshape(-1) / USUAL_MM**2
         for first in range(0, len(residuals), _ROWS):
             some = slice(first, first + _ROWS)
-            rows = np.zeros((len(residuals[some]), *coefficients.shape))
-            for frames, shares in zip(seen.frames[:, some], seen.shares[:, some], strict=True):
+            along = np.empty((len(residuals[some]), 3, 6))
+            for place, (frames, shares) in enumerate(zip(seen.frames[:, some], seen.shares[:, some], strict=True)):
                 moved = self._moved(poses[frames], seen.points[some])  # [Q, 3, 6]
-                along = scale * shares[:, None] * np.einsum("qi,qij->qj", slopes[some], moved)
-                rows += splines[frames][:, :, None] * along[:, None]
-            flat = rows.reshape(-1, size)
+                along[:, place] = scale * shares[:, None] * np.einsum("qi,qij->qj", slopes[some], moved)
+            flat = (splines[seen.frames[:, some]].transpose(1, 2, 0) @ along).reshape(-1, size)
             weighted = flat.T * weights[some]
             normal += weighted @ flat
             right += weighted @ residuals[some]

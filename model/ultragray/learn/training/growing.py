@@ -71,7 +71,7 @@ RECENT_FRAMES, RECENT_STEPS = 16, 40  # of a new frame, every other is on recent
 COARSE_STEPS = (60, 20)  # of Gaussians' first: on frames of half the size; of a quarter, which take a third of the time
 COARSE_GAUSSIANS = 0.5  # of the pixels of a frame: with more of them, it is they that take the time
 FLOOR_STEPS = 75  # of a Gaussian's first, in which what lies in a shadow keeps its floor
-JUDGES = 8  # held-out frames of a version, beside those that are new since the one before
+JUDGES, NEW_JUDGES = 12, 4  # held-out frames of a version, of those that judged the one before, and of all others
 LEAST_CAUTION, REGAINED = 0.05, 1.1  # of the factor on all rates: its least, and what a version gives back of it
 LOST_DB = 0.2  # a version that shows the frames before it worse by so much is not shown
 
@@ -102,9 +102,9 @@ class GrowingTrainer:
         self._grown = self._surveyed = 0  # training frames that Gaussians began on; that were there at the last survey
         self._parameters: dict[str, Tensor] = {}
         self._born, self._floor = torch.zeros(0, dtype=torch.int64), torch.zeros(0)  # [N]
-        # PSNR of the newest version shown that was judged by a held-out frame; after a death perhaps by some that are
-        # still to come again.
-        self.judged: dict[int, float] = {}
+        # PSNR of the version shown on the held-out frames that judged it; after a death perhaps on some that are still
+        # to come again.
+        self.judged: Mapping[int, float] = {}
         self._whole: PoseRefinement | None = None  # the poses of a sweep that came at once
         self._every = 1  # so-manyth scan line of a frame is in a step
         self._caution = 1.0  # factor on all rates: less after a version that was worse
@@ -188,13 +188,14 @@ class GrowingTrainer:
         return GaussianScene.from_splats(no_smaller_than_held(splats), info=info, **poses)
 
     def judge(self) -> Judgement:
-        """Measures the scene on some held-out frames that the version shown was judged by, and on all newer ones."""
+        """Measures the scene on some held-out frames that judged the version shown, and on some others."""
         held_out = self._held_out
         if held_out is None or not len(held_out):
             return Judgement({}, {})
         known = np.array(sorted(place for place in self.judged if place < len(held_out)), np.int64)
-        newer = np.setdiff1d(np.arange(len(held_out)), known)
-        chosen = np.concatenate([known[spread_places(len(known), JUDGES)], newer[spread_places(len(newer), JUDGES)]])
+        others = np.setdiff1d(np.arange(len(held_out)), known)
+        known, others = known[spread_places(len(known), JUDGES)], others[spread_places(len(others), NEW_JUDGES)]
+        chosen = np.concatenate([known, others])
         psnr_db, ms_ssim = {}, {}
         parts = rendered_parts(self._view(), held_out.select(chosen), ("bmode",), self._chosen_backend)
         places = iter(chosen.tolist())
@@ -213,7 +214,7 @@ class GrowingTrainer:
 
     def accept(self, judgement: Judgement) -> None:
         """Counts the version of this judgement as the one that is shown."""
-        self.judged |= judgement.psnr_db
+        self.judged = judgement.psnr_db
         self._caution = min(1.0, REGAINED * self._caution)
 
     def slow_down(self) -> None:

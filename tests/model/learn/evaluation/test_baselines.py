@@ -1,6 +1,7 @@
 """Frames predicted from frames: the nearest, between two planes, and compounded volumes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ultragray.learn.evaluation.baselines import (
     interpolate_planes,
     predict,
 )
+from ultragray.learn.prediction import blend_by_distance, seen_by_frame
 from ultragray.learn.sweep import nearest_frames, pixel_positions_mm
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
@@ -52,6 +54,37 @@ def test_between_two_planes_the_distance_decides(probe):
     np.testing.assert_allclose(planes[1], 0.75 * images[0] + 0.25 * images[1], atol=1e-6)
     np.testing.assert_allclose(planes[2], images[1], atol=1e-6)
     np.testing.assert_allclose(planes[3], (images[1] + 2 * images[2]) / 3, atol=1e-6)
+
+
+def plainly_interpolated(sweep, pose, frames):
+    """The definition of `interpolate_planes`, frame by frame, for one plane."""
+    points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width) @ pose[:3, :3].T + pose[:3, 3]
+    distances, values = np.full((2, len(points)), np.inf), np.zeros((2, len(points)))
+    for frame in frames:
+        local = (points - sweep.poses[frame, :3, 3]) @ sweep.poses[frame, :3, :3]
+        inside, seen = seen_by_frame(sweep, frame, local)
+        for side, height in enumerate((local[inside, 1], -local[inside, 1])):
+            nearer = (height >= 0) & (height < distances[side, inside])
+            distances[side, np.flatnonzero(inside)[nearer]] = height[nearer]
+            values[side, np.flatnonzero(inside)[nearer]] = seen[nearer]
+    return np.nan_to_num(blend_by_distance(values, distances)).reshape(sweep.height, sweep.width) / 255.0
+
+
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED], ids=lambda probe: probe.kind)
+def test_interpolation_is_that_of_its_definition(probe):
+    """Frames cross each other, and show only parts of the planes."""
+    rng, poses = np.random.default_rng(3), np.tile(np.eye(4), (14, 1, 1))
+    axes, signs = np.linalg.qr(np.eye(3) + rng.normal(0.0, 0.15, (14, 3, 3)))
+    poses[:, :3, :3] = axes * np.sign(np.diagonal(signs, axis1=1, axis2=2))[:, None]
+    poses[:, :3, 3] = rng.normal(400.0, 1.5, (14, 3))
+    sweep = replace(sweep_of(poses[:10], probe), images=rng.integers(0, 255, (10, 20, 16), np.uint8))
+    every, some = np.tile(np.arange(10), (4, 1)), np.array([[3, 1, 7], [2, 9, -1], [5, -1, -1], [-1, -1, -1]])
+    for asked, frames in ((None, every), (some, some)):
+        found = interpolate_planes(sweep, poses[10:], asked)
+        expected = [
+            plainly_interpolated(sweep, pose, among[among >= 0]) for pose, among in zip(poses[10:], frames, strict=True)
+        ]
+        assert np.mean(np.abs(found - expected) < 1e-4) > 0.995  # a pixel at the edge of a frame may be in or out
 
 
 def test_beyond_the_last_plane_it_is_taken_as_it_is():

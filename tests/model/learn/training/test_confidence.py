@@ -221,11 +221,11 @@ def test_hard_is_where_neighbours_do_not_tell(side):
     assert hardness[:9].max() < -1.0 < 1.0 < hardness[15:].min()
 
 
-def test_predictions_are_the_same_however_many_are_scored_at_once(monkeypatch):
+def test_predictions_are_the_same_however_many_are_made_at_once(monkeypatch):
     sweep = changing_sweep(8, 32)
     found = []
-    for at_once in (confidence.SCORED_AT_ONCE, 3, 1):
-        monkeypatch.setattr(confidence, "SCORED_AT_ONCE", at_once)
+    for at_once in (confidence.PREDICTED_AT_ONCE, 3, 1):
+        monkeypatch.setattr(confidence, "PREDICTED_AT_ONCE", at_once)
         found.append([(one.target, one.is_nearest, one.ms_ssim) for one in one_sided(sweep)])
     assert len(found[0]) > 8
     assert found[0] == found[1] == found[2]
