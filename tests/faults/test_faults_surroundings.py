@@ -31,6 +31,7 @@ from .test_faults_jobs import (
     training,
 )
 
+REMOVED_WITHIN_S = 30.0  # a worker removes the folder of a job when the job's end has been told
 CUTS = max(4, KILLS // 2)
 TIME_LIMIT_S = 600.0 + 60.0 * CUTS
 STALL_TIMEOUT_S = 30.0  # longer than a process is stopped here: that one goes on
@@ -117,6 +118,9 @@ def test_every_job_ends_as_if_nothing_had_failed(machine, postgres):
                 surroundings.fail()
                 due_at = time.monotonic() + 1.0
         assert {job.state for job in jobs.values()} == {JobState.SUCCEEDED}, (jobs, machine.told())
+        ended = time.monotonic()
+        while any((machine.artifacts / "work").iterdir()) and time.monotonic() - ended < REMOVED_WITHIN_S:
+            machine.tend_for(0.2)
     finally:
         machine.kill_all()
         store.close()
