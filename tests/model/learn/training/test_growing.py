@@ -39,7 +39,8 @@ def grown(sweep, until=COUNT, steps=3):
 
 
 def all_psnr_db(trainer, monkeypatch):
-    monkeypatch.setattr(growing, "JUDGES", COUNT)
+    for some in ("JUDGES", "NEW_JUDGES"):
+        monkeypatch.setattr(growing, some, COUNT)
     return trainer.judge().mean_psnr_db
 
 
@@ -182,6 +183,16 @@ def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_been_killed(sweep, tmp_pa
     again.restore(tmp_path / "checkpoint", sweep.images[:count], sweep.poses[:count])
     assert (count, again.step, again.gaussian_count) == (16, trainer.step, trainer.gaussian_count)
     assert end(again) == pytest.approx(end(trainer), abs=0.3)
+
+
+def test_a_version_is_compared_with_the_one_shown_and_not_with_earlier_ones(sweep, monkeypatch):
+    monkeypatch.setattr(growing, "NEW_JUDGES", 1)
+    trainer = grown(sweep, steps=0)
+    trainer.accept(Judgement({0: 10.0, 1: 40.0}, {}))
+    trainer.accept(Judgement({1: 24.0, 2: 24.0}, {}))
+    assert trainer.judge().psnr_db.keys() == {0, 1, 2}
+    assert not trainer.is_worse(Judgement({0: 0.0, 1: 23.9, 2: 24.0}, {}))
+    assert trainer.is_worse(Judgement({0: 40.0, 1: 23.5, 2: 24.0}, {}))
 
 
 def test_a_version_shown_before_a_death_may_have_been_judged_by_frames_that_are_still_to_come_again(sweep, tmp_path):
