@@ -98,7 +98,6 @@ PIXELS_PER_GAUSSIAN, LEAST_PIXELS = 25, 12  # the latter, of distinct ones, wher
 DIFFERENT_DETAIL, SAME_DETAIL = 0.25, 0.5  # correlation of that of neighbours, up to which and from which on
 STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
 MIN_STEPS, USUAL_STEPS = 250, 1_500  # fewer leave shadows unlearned
-FEWER_STEPS = 750  # the least of a large sweep: with 700, ultranerf_liver lost .001 of GMS and GMSD
 MIN_GAUSSIANS, USUAL_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy; enough unless much more is to be seen
 MAX_GAUSSIANS = 600_000  # of a large volume that is seen finely
 LEAST_LIT = 8  # grey value, of 255, of a pixel that shows something
@@ -156,14 +155,12 @@ class Geometry:
     def steps(self, views_between: float) -> int:
         """By the frames, likewise; more than USUAL_STEPS as the square root of the Gaussians that are more.
 
-        Fewer likewise, down to FEWER_STEPS, where USUAL_GAUSSIANS are less than the pixels would have: each is the mean
-        of what many pixels show, and a step tells it more.
+        Fewer likewise, down to a half, where there are fewer Gaussians than the pixels would have: each is the mean of
+        what many pixels show, and a step tells it more.
         """
-        times, count = _times(views_between), self.gaussian_count(views_between)
-        share = count / USUAL_GAUSSIANS
-        if count <= USUAL_GAUSSIANS:
-            share = USUAL_GAUSSIANS / max(self._usual_gaussians(views_between), USUAL_GAUSSIANS)
-        most = max(FEWER_STEPS, USUAL_STEPS * math.sqrt(share))
+        times, count = _times(views_between), max(self.gaussian_count(views_between), USUAL_GAUSSIANS)
+        by_pixels = max(count, min(self._usual_gaussians(views_between), MAX_GAUSSIANS))
+        most = USUAL_STEPS * count / math.sqrt(USUAL_GAUSSIANS * by_pixels)
         return min(max(times * STEPS_PER_FRAME * self.frame_count, times * MIN_STEPS), round(most))
 
     def _usual_gaussians(self, views_between: float) -> int:

@@ -214,7 +214,10 @@ def test_a_large_volume_that_is_seen_finely_gets_more_gaussians_and_steps():
     large = replace(usual, distinct_pixels=12_000_000)
     assert (large.gaussian_count(0.5), large.steps(0.5)) == (600_000, 3_000)
     assert large.gaussian_count(0.0) == 480_000
-    assert replace(large, distinct_pixels=3_000_000).gaussian_count(0.5) == 240_000
+    some = replace(large, distinct_pixels=3_000_000)
+    assert (some.gaussian_count(0.5), some.steps(0.5)) == (240_000, 1_200)
+    hardly = replace(large, distinct_pixels=1_875_100)
+    assert (hardly.gaussian_count(0.5), hardly.steps(0.5)) == (150_008, 750)  # no leap beside `usual`
     assert replace(large, frame_count=20).steps(0.5) == 600
 
 
