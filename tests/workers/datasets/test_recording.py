@@ -123,5 +123,11 @@ def test_pixels_come_as_grey_values_or_as_a_png_file():
         SETTINGS.pixels(png_file(frame.pixels[:8]))
     with pytest.raises(InvalidArgument, match="constant"):
         SETTINGS.pixels(bytes(16 * 12))
-    with pytest.raises(InvalidArgument, match="PNG"):
-        SETTINGS.pixels(b"nonsense")
+    with pytest.raises(InvalidArgument, match="must be a PNG"):
+        SETTINGS.pixels(b"\x89PNG, but not for long")
+
+
+@pytest.mark.parametrize("count", [0, 8, 16 * 12 - 1])
+def test_pixels_of_another_size_are_told_with_their_bytes(count):
+    with pytest.raises(InvalidArgument, match=rf"PNG file, or 16x12 = 192 bytes of grey pixels.* got {count} bytes"):
+        SETTINGS.pixels(bytes(count))

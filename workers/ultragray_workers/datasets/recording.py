@@ -34,6 +34,7 @@ from ultragray_workers.storage.storage import NotThere, Storage
 RECORDINGS, BLOCKS = "recordings", "recording-blocks"  # prefixes of keys
 FORMAT_VERSION = 1
 PAUSE_S = 2.0  # between frames; more is told as a pause
+_PNG = b"\x89PNG"
 _LENGTH_BYTES = 4  # before the JSON of a block, its length, the low byte first
 
 
@@ -54,10 +55,17 @@ class RecordingSettings(Contract):
     def pixels(self, image: bytes) -> ByteArray:  # [H, W]
         """The pixels of a frame as it came: grey ones of 8 bits, row by row, or a PNG file.
 
-        Raises InvalidArgument for a damaged file and for a frame in which every pixel is the same, InvalidImageSize.
+        Raises InvalidArgument for what is neither and for a frame in which every pixel is the same, InvalidImageSize.
         """
         height, width = self.image_height, self.image_width
-        pixels = read_grey(image, height, width) if len(image) == height * width else read_png(image)
+        is_raw = len(image) == height * width
+        if not is_raw and not image.startswith(_PNG):
+            raise InvalidArgument(
+                f"image must be a PNG file, or {height}x{width} = {height * width} bytes of grey pixels, as the "
+                f"recording was begun, got {len(image)} bytes that are neither",
+                field="image",
+            )
+        pixels = read_grey(image, height, width) if is_raw else read_png(image)
         if pixels.shape != (height, width):
             raise InvalidImageSize(
                 f"image must be {height}x{width}, as the recording was begun, got {pixels.shape[0]}x{pixels.shape[1]}",
