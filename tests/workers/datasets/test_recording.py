@@ -102,12 +102,37 @@ def test_a_recording_that_was_deleted_is_not_found(recordings, tmp_path):
     assert not list((tmp_path / "recording-blocks").rglob("0*"))
 
 
-def test_a_dataset_holds_every_fifth_frame_out_and_tells_what_was_lost(recordings):
-    recordings.writer("liver").append([*frames(0, 1, 2, 3, 5, 6, 7), *frames(90)])
+def test_a_dataset_holds_every_fifth_frame_out(recordings):
+    recordings.writer("liver").append(frames(*range(8)))
     dataset, remarks = recorded_dataset(recordings, "liver")
-    assert (len(dataset.train), len(dataset.val)) == (6, 2)
-    assert "83 frames were lost" in remarks[0]
-    assert "paused 1 times" in remarks[1]
+    assert (len(dataset.train), len(dataset.val), remarks) == (6, 2, ())
+
+
+@pytest.mark.parametrize(
+    ("numbers", "remarks"),
+    [
+        ([1, 2, 3], ["1 frame is missing, lost on the way or refused, before frame 1"]),
+        ([0, 1, 3, 4], ["1 frame is missing, lost on the way or refused, after frame 1"]),
+        ([6, 7, 9], ["7 frames are missing, lost on the way or refused, in 2 places, the first before frame 6"]),
+        (
+            [0, 1, 3, 90],
+            [
+                "87 frames are missing, lost on the way or refused, in 2 places, the first after frame 1",
+                "the recording paused once, for 9 s",
+            ],
+        ),
+        (
+            [0, 30, 90],
+            [
+                "88 frames are missing, lost on the way or refused, in 2 places, the first after frame 0",
+                "the recording paused 2 times, at most for 6 s",
+            ],
+        ),
+    ],
+)
+def test_what_is_missing_is_told(recordings, numbers, remarks):
+    recordings.writer("liver").append(frames(*numbers))
+    assert list(recorded_dataset(recordings, "liver")[1]) == remarks
 
 
 def test_a_recording_without_frames_is_no_dataset(recordings):

@@ -247,13 +247,18 @@ def recorded_dataset(recordings: Recordings, name: str) -> tuple[Dataset, tuple[
 
 
 def _remarks(frames: Sequence[RecordedFrame]) -> Iterator[str]:
-    numbers = [-1, *(frame.number for frame in frames)]
-    if gaps := [(before, after - before - 1) for before, after in pairwise(numbers) if after - before > 1]:
-        lost = sum(count for _, count in gaps)
-        yield f"{lost:,} frames were lost on the way, in {len(gaps)} places, the first after frame {gaps[0][0]}"
+    numbers = [-1, *(frame.number for frame in frames)]  # a sender counts from 0
+    if gaps := [(before, after) for before, after in pairwise(numbers) if after - before > 1]:
+        missing = sum(after - before - 1 for before, after in gaps)
+        before, after = gaps[0]
+        place = f"before frame {after}" if before < 0 else f"after frame {before}"
+        places = place if len(gaps) == 1 else f"in {len(gaps):,} places, the first {place}"
+        are_missing = "1 frame is missing" if missing == 1 else f"{missing:,} frames are missing"
+        yield f"{are_missing}, lost on the way or refused, {places}"
     times = [frame.time_s for frame in frames if frame.time_s is not None]
     if pauses := [after - before for before, after in pairwise(times) if after - before > PAUSE_S]:
-        yield f"the recording paused {len(pauses)} times, for {max(pauses):.0f} s at most"
+        paused = "once, for" if len(pauses) == 1 else f"{len(pauses):,} times, at most for"
+        yield f"the recording paused {paused} {max(pauses):.0f} s"
 
 
 def _key(name: str) -> str:
