@@ -1,4 +1,5 @@
-"""Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json.
+"""Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json, and, an addition of
+ours, times_*.npy.
 
 conf.json says where the planes are, in centimetres and degrees (`ultragray.exchange.released_config`); poses are in
 mm. Rows lie where Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 is for released
@@ -28,8 +29,8 @@ def read_released(path: str | Path) -> Dataset:
     """The dataset that a conf.json describes; `path` is that file, or the folder that holds it.
 
     Images are uint8 or floats in [0, 1], [N, H, W], [N, 1, H, W] or in colour [N, H, W, 3 or 4]; poses [N, 4, 4] or
-    [N, 3, 4], probe→tracker, mm. Where conf.json names no held-out files there are no held-out frames. Raises
-    DatasetInvalid, naming the file, the frame and the reason.
+    [N, 3, 4], probe→tracker, mm; times, which may be missing, [N], s. Where conf.json names no held-out files there are
+    no held-out frames. Raises DatasetInvalid, naming the file, the frame and the reason.
     """
     path = Path(path)
     if path.is_dir():
@@ -65,6 +66,8 @@ def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
     images, (numbers, poses, count) = _read_images(images_path), _read_poses(poses_path)
     if len(images) != count:
         raise DatasetInvalid(f"{images_path} holds {len(images)} images, but {poses_path} {count} poses")
+    times_key = f"times_file_{part}"
+    times_s = _read_times(_file(config, times_key), count)[numbers] if times_key in config.files else None
     return Sweep(
         images=images if len(numbers) == count else images[numbers],
         poses=poses,
@@ -73,6 +76,7 @@ def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
         source=str(images_path),
         notes=no_pose_note(numbers, count, poses_path),
         chain=Chain((Link("Probe", "Tracker", "pose", poses_path.name, is_tracked=True),)),
+        times_s=times_s,
     )
 
 
@@ -107,6 +111,19 @@ def _read_poses(path: Path) -> tuple[IntArray, FloatArray, int]:  # [F], [F, 4, 
     return numbers, check_frame_poses(poses[numbers], numbers, str(path)), len(poses)
 
 
+def _read_times(path: Path, count: int) -> FloatArray:  # [F] s
+    try:
+        times = map_npy(path)
+    except (OSError, ValueError) as error:
+        raise DatasetInvalid(f"{path}: not an array of times that can be read: {error}") from error
+    if times.dtype.kind not in "fiu" or times.shape != (count,):
+        raise DatasetInvalid(f"{path}: times must be numbers [{count}], got {times.dtype} {list(times.shape)}")
+    times_s = np.array(times, np.float64)
+    if len(wrong := np.flatnonzero(~np.isfinite(times_s))):
+        raise DatasetInvalid(f"{path}: times must be finite, those of frames {frame_list(wrong)} are not")
+    return times_s
+
+
 def no_pose_note(numbers: IntArray, count: int, path: Path) -> tuple[str, ...]:
     """What a person is told of the frames without a pose."""
     missing = sorted(set(range(count)) - set(numbers.tolist()))
@@ -124,7 +141,12 @@ def write_released(dataset: Dataset, folder: str | Path, *, replace: bool = Fals
     """
     folder = Path(folder)
     parts = [(part, sweep) for part, sweep in (("train", dataset.train), ("val", dataset.val)) if len(sweep)]
-    arrays = {(kind, part): getattr(sweep, kind) for part, sweep in parts for kind in ("images", "poses")}
+    arrays = {
+        (kind, part): array
+        for part, sweep in parts
+        for kind, array in (("images", sweep.images), ("poses", sweep.poses), ("times", sweep.times_s))
+        if array is not None
+    }
     for file_name in (CONFIG_NAME, *(_array_name(*key) for key in arrays)):
         if (folder / file_name).exists() and not replace:
             raise InvalidArgument(f"{folder / file_name} already exists: choose another folder", field="output")

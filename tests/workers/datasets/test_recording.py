@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,21 @@ def test_a_dataset_holds_every_fifth_frame_out(recordings):
 def test_what_is_missing_is_told(recordings, numbers, remarks):
     recordings.writer("liver").append(frames(*numbers))
     assert list(recorded_dataset(recordings, "liver")[1]) == remarks
+
+
+def test_the_dataset_has_the_times_of_the_frames(recordings):
+    recordings.writer("liver").append(frames(*range(8)))
+    dataset, _ = recorded_dataset(recordings, "liver")
+    np.testing.assert_allclose(dataset.train.times_s, [0.0, 0.1, 0.3, 0.4, 0.5, 0.6])
+    np.testing.assert_allclose(dataset.val.times_s, [0.2, 0.7])
+
+
+@pytest.mark.parametrize("time_s", [None, float("nan"), float("inf")])
+def test_a_dataset_has_no_times_where_a_frame_has_none(recordings, time_s):
+    first, *others = frames(*range(8))
+    recordings.writer("liver").append([replace(first, time_s=time_s), *others])
+    dataset, remarks = recorded_dataset(recordings, "liver")
+    assert (dataset.train.times_s, dataset.val.times_s, remarks) == (None, None, ())
 
 
 def test_a_recording_without_frames_is_no_dataset(recordings):

@@ -11,6 +11,7 @@ power the last block may be cut off; the next writer removes it. `datasets.intak
 from __future__ import annotations
 
 import json
+import math
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -230,20 +231,28 @@ class RecordingWriter:
 def recorded_dataset(recordings: Recordings, name: str) -> tuple[Dataset, tuple[str, ...]]:
     """A recording as the data set that it becomes, every fifth frame held out, and what a person is to be told of it.
 
-    Raises DatasetNotFound, DatasetInvalid where there are too few frames.
+    It has the times of the frames where each has one. Raises DatasetNotFound, DatasetInvalid where there are too few
+    frames.
     """
     settings = recordings.settings(name)
     frames = [frame for block in recordings.frames(name) for frame in block]
     height, width = settings.image_height, settings.image_width
+    times = _times(frames)
     sweep = Sweep(
         np.stack([frame.pixels for frame in frames]) if frames else np.zeros((0, height, width), np.uint8),
         np.stack([frame.pose for frame in frames]) if frames else np.zeros((0, 4, 4)),
         settings.probe,
         np.arange(len(frames)),
         name,
+        times_s=np.array(times) if len(times) == len(frames) else None,
     )
     train, val = split_sequence(sweep, len(sweep), None, None)
     return Dataset(name, train, val), tuple(_remarks(frames))
+
+
+def _times(frames: Sequence[RecordedFrame]) -> list[float]:
+    """The times of the frames that have one, s; NaN and infinity are none."""
+    return [frame.time_s for frame in frames if frame.time_s is not None and math.isfinite(frame.time_s)]
 
 
 def _remarks(frames: Sequence[RecordedFrame]) -> Iterator[str]:
@@ -255,8 +264,7 @@ def _remarks(frames: Sequence[RecordedFrame]) -> Iterator[str]:
         places = place if len(gaps) == 1 else f"in {len(gaps):,} places, the first {place}"
         are_missing = "1 frame is missing" if missing == 1 else f"{missing:,} frames are missing"
         yield f"{are_missing}, lost on the way or refused, {places}"
-    times = [frame.time_s for frame in frames if frame.time_s is not None]
-    if pauses := [after - before for before, after in pairwise(times) if after - before > PAUSE_S]:
+    if pauses := [after - before for before, after in pairwise(_times(frames)) if after - before > PAUSE_S]:
         paused = "once, for" if len(pauses) == 1 else f"{len(pauses):,} times, at most for"
         yield f"the recording paused {paused} {max(pauses):.0f} s"
 
