@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,6 +126,15 @@ def test_the_client_records_what_an_iterator_gives_and_goes_on_later(client, beg
     client.recordings.delete(begun)
     with pytest.raises(errors.DatasetNotFound):
         client.recordings.get(begun)
+
+
+def test_the_client_is_told_of_a_second_sweep_that_counts_from_0_again(client, begun):
+    list(client.recordings.record(begun, map(frame_of, range(4))))
+    second = (replace(frame_of(number), number=number - 4) for number in range(4, 7))
+    answers = list(client.recordings.record(begun, second))
+    told = [(one.error.sequence, one.error.field) for one in answers if one.error is not None]
+    assert told == [(0, "number"), (1, "number"), (2, "number")]
+    assert answers[-1].recording.frames == 4
 
 
 def test_a_service_that_is_killed_between_frames_loses_none_that_it_acknowledged(start_service, tmp_path):

@@ -70,19 +70,23 @@ class RecordingStream:
         return _viewed(self._owners, self._writer.state)
 
     async def put(self, frame: IncomingFrame) -> None:
-        """Takes a frame; one whose number was stored or passed already is left out.
+        """Takes a frame; one that is sent again though it is stored is left out.
 
-        Raises InvalidArgument and its kinds for a frame that cannot be recorded, after which others can, and what
-        storing those before it has raised.
+        Raises InvalidArgument and its kinds for a frame that cannot be recorded, such as another one of a number that
+        was passed already, after which others can, and what storing those before it has raised.
         """
         self.require_stored()
         number = self._next_number if frame.number is None else frame.number
         if not 0 <= number <= MAX_NUMBER:
             raise InvalidArgument(f"number must be from 0 to {MAX_NUMBER}, got {number}", field="number")
         pixels = await asyncio.to_thread(self._writer.state.settings.pixels, frame.image)
-        self._waiting.append(RecordedFrame(number, frame.time_s, frame.pose, pixels))
+        recorded = RecordedFrame(number, frame.time_s, frame.pose, pixels)
+        if number < self._next_number:
+            await self._require_sent_again(recorded)
+            return
+        self._waiting.append(recorded)
         self._waiting_bytes += pixels.nbytes
-        self._next_number = max(self._next_number, number + 1)
+        self._next_number = number + 1
         if self._storing is None or self._storing.done():
             self._storing = asyncio.create_task(self._store())
         if self._waiting_bytes > MAX_WAITING_BYTES:
@@ -99,6 +103,16 @@ class RecordingStream:
         """Raises what storing a frame has raised, whatever it is."""
         if self._failure is not None:
             raise self._failure
+
+    async def _require_sent_again(self, frame: RecordedFrame) -> None:
+        await self.stored()
+        if not await asyncio.to_thread(self._writer.has, frame):
+            raise InvalidArgument(
+                f"number must be at least {self._next_number}, the next of this recording, got {frame.number} with a "
+                "frame that is not stored under it: a sweep goes on counting where the one before ended, or leaves "
+                "number out",
+                field="number",
+            )
 
     async def _store(self) -> None:
         try:

@@ -58,8 +58,19 @@ def test_frames_come_back_as_they_were_added(recordings):
 
 def test_a_writer_goes_on_where_one_that_died_has_left_off(recordings):
     recordings.writer("liver").append(frames(0, 1))
-    state = recordings.writer("liver").append(frames(1, 2))  # the sender did not learn that 1 was stored
+    state = recordings.writer("liver").append(frames(2))
     assert (state.frames, numbers_in(recordings)) == (3, [0, 1, 2])
+
+
+def test_a_writer_knows_the_very_frames_that_are_stored(recordings):
+    writer = recordings.writer("liver")
+    for numbers in ([1, 2], [4], [7, 8], [9]):
+        writer.append(frames(*numbers))
+    for known in (writer, recordings.writer("liver")):
+        assert [one.number for one in frames(*range(12)) if known.has(one)] == [1, 2, 4, 7, 8, 9]
+    (one,) = frames(7)
+    assert not writer.has(replace(one, pixels=one.pixels.T.reshape(one.pixels.shape)))
+    assert not writer.has(replace(one, pose=np.eye(4)))
 
 
 def test_a_block_that_was_cut_off_goes_and_its_frames_are_sent_again(recordings, tmp_path):

@@ -13,8 +13,9 @@ from __future__ import annotations
 import json
 import math
 import secrets
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
@@ -196,36 +197,48 @@ class RecordingWriter:
             storage.delete(last)
             del sizes[last]
         self._count = len(sizes)
+        self._first_numbers: dict[int, int] = {}  # of blocks that were looked into
         self.state = RecordingState(name, header.settings, frames, next_number, sum(sizes.values()), header.created_at)
 
+    def has(self, frame: RecordedFrame) -> bool:
+        """Whether this very frame is stored: its number, with its pose and pixels.
+
+        Numbers rise from block to block, and within one.
+        """
+        after = bisect_right(range(self._count), frame.number, key=self._first_number)
+        found = _unpack(self._storage.read(_block_key(self._header, after - 1)), self._header.settings) if after else ()
+        return any(
+            one.number == frame.number
+            and np.array_equal(one.pose, frame.pose)
+            and np.array_equal(one.pixels, frame.pixels)
+            for one in found or ()
+        )
+
     def append(self, frames: Sequence[RecordedFrame], max_bytes: int | None = None) -> RecordingState:
-        """Stores frames in one block; those of numbers that are stored already, or passed, are left out.
+        """Stores frames, at least one, in one block. Their numbers rise, from `next_number` of the state on.
 
         Raises RecordingTaken where somebody else has added to the recording, UploadTooLarge beyond `max_bytes`.
         """
-        state, new = self.state, []
-        next_number = state.next_number
-        for frame in frames:
-            if frame.number >= next_number:
-                new.append(frame)
-                next_number = frame.number + 1
-        if not new:
-            return state
-        data = _pack(self._token, state.frames, new)
+        state = self.state
+        data = _pack(self._token, state.frames, frames)
         if max_bytes is not None and state.bytes + len(data) > max_bytes:
             raise UploadTooLarge(f"a recording may have at most {max_bytes} bytes", field="dataset")
         if not self._storage.write(_block_key(self._header, self._count), data, if_absent=True):
             raise RecordingTaken(f"somebody else records {state.name!r} as well: one may at a time", field="dataset")
         self._count += 1
-        self.state = RecordingState(
-            state.name,
-            state.settings,
-            state.frames + len(new),
-            next_number,
-            state.bytes + len(data),
-            state.created_at,
+        self.state = replace(
+            state,
+            frames=state.frames + len(frames),
+            next_number=frames[-1].number + 1,
+            bytes=state.bytes + len(data),
         )
         return self.state
+
+    def _first_number(self, block: int) -> int:
+        if block not in self._first_numbers:
+            told = _document(self._storage.read(_block_key(self._header, block)))
+            self._first_numbers[block] = told["frames"][0]["number"]
+        return self._first_numbers[block]
 
 
 def recorded_dataset(recordings: Recordings, name: str) -> tuple[Dataset, tuple[str, ...]]:

@@ -59,7 +59,7 @@ async def get_recording(service: ServiceDep, dataset: DatasetName) -> RecordingV
     "/{dataset}/frames", openapi_extra=_FRAME, responses=problems(401, 403, 404, 409, 413, 415, 422, 429, 503, 507)
 )
 async def add_frame(request: Request, service: ServiceDep, dataset: DatasetName) -> RecordingView:
-    """Adds a frame. It is stored when the answer comes; one whose number was stored already is left out."""
+    """Adds a frame. It is stored when the answer comes; one that is sent again though it is stored is left out."""
     service.life.require_serving()
     require_uncompressed(request)
     content_type = request.headers.get("content-type", FRAME_TYPE)
