@@ -115,6 +115,28 @@ def test_over_a_websocket_bad_frames_are_told_and_the_others_go_on(service, http
     assert [(one["refused_number"], one["error"]["field"]) for one in answers if one["error"]] == [(1, "image")]
 
 
+def test_a_frame_that_cannot_be_read_is_told_with_its_own_number(service, http, begun):
+    sheared, nameless = np.eye(4), message_of(5, pose=np.zeros((4, 4))).replace(b'"number": 5', b'"number":-5')
+    sheared[0, 1] = 0.5
+    heads = {4: {"number": 4}, 6: {"number": 6, "pose": None}, None: ["number"]}
+    texts = {number: json.dumps(head).encode() for number, head in heads.items()}
+    bad = {number: len(text).to_bytes(4, "little") + text + b"image" for number, text in texts.items()}
+    with connect(f"{service.http.replace('http', 'ws', 1)}/v1/recordings/{begun}/stream") as socket:
+        for message in (message_of(3, pose=sheared), *bad.values(), nameless, b"\1\0", "hello", message_of(7), ""):
+            socket.send(message)
+        answers = [json.loads(answer) for answer in socket]
+    assert [one["refused_number"] for one in answers if one["error"]] == [3, 4, 6, *[None] * 4]
+    assert answers[-1]["recording"]["frames"] == 1
+
+
+def test_the_client_is_told_which_pose_is_none(client, begun):
+    lost = [replace(frame_of(number), pose=np.full((4, 4), np.nan)) for number in (2, 5)]
+    frames = [frame_of(0), frame_of(1), lost[0], frame_of(3), frame_of(4), lost[1]]  # the last one is not stored either
+    answers = list(client.recordings.record(begun, frames))
+    assert [one.error.sequence for one in answers if one.error is not None] == [2, 5]
+    assert answers[-1].recording.frames == 4
+
+
 def test_the_client_records_what_an_iterator_gives_and_goes_on_later(client, begun):
     first = list(client.recordings.record(begun, map(frame_of, range(4))))
     assert first[-1].recording.frames == 4

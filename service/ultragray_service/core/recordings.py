@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 from ultragray.contract import described
-from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Slots
@@ -43,6 +43,14 @@ class IncomingFrame:
     image: bytes  # grey pixels of 8 bits, row by row, or a PNG file
     number: int | None = None  # in the sender's count; None: the next
     time_s: float | None = None
+
+
+@dataclass(frozen=True)
+class RefusedFrame:
+    """A frame that cannot be recorded, and why."""
+
+    number: int | None  # as its sender told it
+    error: InvalidArgument
 
 
 @dataclass(frozen=True)
@@ -136,27 +144,27 @@ class RecordingAnswer:
 
 async def record(
     stream: RecordingStream,
-    receive: Callable[[], Awaitable[IncomingFrame | None]],  # None: the client has sent all
+    receive: Callable[[], Awaitable[IncomingFrame | RefusedFrame | None]],  # None: the client has sent all
     send: Callable[[RecordingAnswer], Awaitable[None]],
     draining: asyncio.Event,
 ) -> None:
     """Records what a client sends, to its end. Raises what storing raises, and Draining where the service stops."""
     sending = asyncio.Lock()
 
-    async def answer(number: int | None = None, error: UltragrayError | None = None) -> None:
+    async def answer(refused: RefusedFrame | None = None) -> None:
+        number, error = (None, None) if refused is None else (refused.number, Refusal.of(refused.error))
         async with sending:
-            await send(RecordingAnswer(stream.state, number, None if error is None else Refusal.of(error)))
+            await send(RecordingAnswer(stream.state, number, error))
 
     async def take() -> None:
-        while True:
-            number = None
+        while (frame := await receive()) is not None:
+            if isinstance(frame, RefusedFrame):
+                await answer(frame)
+                continue
             try:
-                if (frame := await receive()) is None:
-                    return
-                number = frame.number
                 await stream.put(frame)
             except InvalidArgument as error:
-                await answer(number, error)
+                await answer(RefusedFrame(frame.number, error))
 
     async def tell() -> None:
         while True:
