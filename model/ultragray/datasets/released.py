@@ -9,11 +9,13 @@ checkpoints only.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
 from ultragray.datasets.images import grey_frames
 from ultragray.errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.poses import frames_with_pose, read_frame_poses
@@ -25,14 +27,15 @@ from ultragray.learn.sweep import ByteArray, Chain, Dataset, IntArray, Link, Swe
 CONFIG_NAME = "conf.json"
 
 
-def read_released(path: str | Path) -> Dataset:
+def read_released(path: str | Path, image_delay_ms: str | None = None) -> Dataset:
     """The dataset that a conf.json describes; `path` is that file, or the folder that holds it.
 
     Images are uint8 or floats in [0, 1], [N, H, W], [N, 1, H, W] or in colour [N, H, W, 3 or 4]; poses [N, 4, 4] or
     [N, 3, 4], probe→tracker, mm; times, which may be missing, [N], s. Where conf.json names no held-out files there are
-    no held-out frames. Raises DatasetInvalid, naming the file, the frame and the reason.
+    no held-out frames. Raises DatasetInvalid, naming the file, the frame and the reason, and InvalidArgument for a
+    delay of images without times.
     """
-    path = Path(path)
+    path, delay_ns = Path(path), parse_delay_ns(image_delay_ms)
     if path.is_dir():
         path = path / CONFIG_NAME
     try:
@@ -43,6 +46,8 @@ def read_released(path: str | Path) -> Dataset:
     train = _read_part(config, "train", probe)
     has_val = bool({"images_file_val", "poses_file_val"} & set(config.files))
     val = _read_part(config, "val", probe) if has_val else train.select([])
+    if delay_ns:
+        train, val = _with_delay(train, val, delay_ns, path)
     return Dataset(name=config.dataset_name or path.resolve().parent.name, train=train, val=val)
 
 
@@ -78,6 +83,23 @@ def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
         chain=Chain((Link("Probe", "Tracker", "pose", poses_path.name, is_tracked=True),)),
         times_s=times_s,
     )
+
+
+def _with_delay(train: Sweep, val: Sweep, delay_ns: int, path: Path) -> list[Sweep]:
+    """Both parts at the poses of a delay before their times, which are of one clock, taken between those of all frames.
+
+    Frames that then have no pose are left out. Raises InvalidArgument where a part has no times.
+    """
+    times = [part.times_s for part in (train, val) if part.times_s is not None]
+    times_s = np.concatenate(times) if len(times) == 2 else None
+    poses, is_known = poses_before(np.concatenate([train.poses, val.poses]), times_s, delay_ns, path)
+    found, first = [], 0
+    for part in (train, val):
+        own = slice(first, first + len(part))
+        moved = replace(part, poses=poses[own], notes=(*part.notes, *delay_note(delay_ns)))
+        found.append(moved.select(np.flatnonzero(is_known[own])))
+        first = own.stop
+    return found
 
 
 def _file(config: ReleasedConfig, key: str) -> Path:

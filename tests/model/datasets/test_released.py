@@ -11,6 +11,7 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import read_released, write_released
+from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
@@ -197,6 +198,23 @@ def test_times_are_written_and_read_back(tmp_path, make_sweep):
     poses[1] = np.nan  # no pose
     np.save(tmp_path / "timed" / "poses_train.npy", poses)
     np.testing.assert_array_equal(read_released(tmp_path / "timed").train.times_s, sweep.times_s[[0, 2, 3, 4]])
+
+
+def test_a_delay_takes_the_poses_between_the_frames_of_both_parts(tmp_path, make_sweep):
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 1, 3] = np.arange(7)
+    sweep = make_sweep(7, poses=poses, times_s=np.arange(7) / 10)
+    write_released(Dataset("timed", sweep.select([0, 1, 3, 4, 6]), sweep.select([2, 5])), tmp_path / "timed")
+    read = load_dataset(tmp_path / "timed", SourceOptions(image_delay_ms="25"))
+    np.testing.assert_allclose(read.train.poses[:, 1, 3], [0.75, 2.75, 3.75, 5.75])  # none is known before the first
+    np.testing.assert_allclose(read.val.poses[:, 1, 3], [1.75, 4.75])
+    assert read.train.frame_numbers.tolist() == [1, 2, 3, 4]
+    assert "25 ms before the stamps" in read.train.notes[-1]
+
+
+def test_a_delay_needs_times(layout):
+    with pytest.raises(InvalidArgument, match=r"image_delay_ms is for recordings with times: .* has none"):
+        read_released(layout.folder, image_delay_ms="25")
 
 
 @pytest.mark.parametrize(
