@@ -66,6 +66,7 @@ from ultragray_client.transport import (
     Deletion,
     Group,
     Listing,
+    LongCall,
     PoseStream,
     Sending,
     Talk,
@@ -243,9 +244,11 @@ class Recordings(Group[AnyConnection]):
         return Talk("RecordingService.RecordFrames", Recorder(name, frames), timeout_s)
 
     @operation
-    def finish(self, name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
-        """Makes a recording a dataset, checked as an upload is. Raises DatasetInvalid."""
-        return Call("RecordingService.FinishRecording", Dataset, timeout_s, dataset=name)
+    def finish(self, name: str, *, timeout_s: float | None = None) -> LongCall[Dataset]:
+        """Makes a recording a dataset, checked as an upload is. Without `timeout_s` it takes as long as it takes.
+        Raises DatasetInvalid.
+        """
+        return LongCall("RecordingService.FinishRecording", Dataset, timeout_s, dataset=name)
 
     @operation
     def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
@@ -650,9 +653,9 @@ class Client(_Client[Connection]):
     used within one event loop.
 
     `timeout_s` is the deadline of each call that names none, all its attempts together. Calls that go on for as long
-    as they take (`render_batch`, `jobs.watch`, up- and downloads) ask a service that fails without any progress again
-    for so long. A call is repeated where the service was not reached, is starting or stopping, or has a full queue,
-    after the delay that it tells; nothing else is.
+    as they take (`render_batch`, `jobs.watch`, `recordings.finish`, up- and downloads) ask a service that fails without
+    any progress again for so long. A call is repeated where the service was not reached, is starting or stopping, or
+    has a full queue, after the delay that it tells; nothing else is.
     """
 
     _connects = Connection

@@ -219,7 +219,7 @@ def _unreachable(sentence: str, address: str) -> ClientError:
     return Unreachable(f"no service answers at {address} ({sentence}){hint}")
 
 
-def error_of_frame(error: scenes_pb2.Error, sequence: int) -> ClientError:
+def error_of_frame(error: scenes_pb2.Error, sequence: int | None) -> ClientError:
     """The error that a stream has in place of a frame."""
     cls = _BY_REASON.get(error.reason, ClientError)
     return cls(error.detail, reason=error.reason, field=error.field or None, sequence=sequence)

@@ -141,8 +141,9 @@ class Recorder(Conversation[RecordingAnswer]):
             while self._unstored and self._unstored[0].number < recording.next_number:
                 self._unstored.popleft()
             if message.HasField("error"):
-                error = error_of_frame(message.error, message.refused_number)
-                self._unstored = deque(one for one in self._unstored if one.number != message.refused_number)
+                number = message.refused_number if message.HasField("refused_number") else None
+                error = error_of_frame(message.error, number)
+                self._unstored = deque(one for one in self._unstored if one.number != number)
         self._is_answered.set()
         return RecordingAnswer(recording, error)
 

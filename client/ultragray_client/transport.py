@@ -218,7 +218,14 @@ class Deletion(Call[None]):
                 raise
 
 
-class Sending(Call[T]):
+class LongCall(Call[T]):
+    """A question that takes as long as the work behind it. No timeout: as long as it takes."""
+
+    async def answer(self, connection: Connection) -> T:
+        return self._read(await self._ask(connection, connection.retries(self._timeout_s)))
+
+
+class Sending(LongCall[T]):
     """Messages that each attempt sends from the first one on, and their answer. No timeout: as long as it takes."""
 
     def __init__(
@@ -226,9 +233,6 @@ class Sending(Call[T]):
     ) -> None:
         super().__init__(method, read, timeout_s)
         self._messages = messages
-
-    async def answer(self, connection: Connection) -> T:
-        return self._read(await self._ask(connection, connection.retries(self._timeout_s)))
 
     def _content(self) -> Any:
         return self._messages()

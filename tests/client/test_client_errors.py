@@ -1,6 +1,7 @@
 """Every error of the service arrives as one of the client's; what is asked again, for how long, and what is not."""
 
 import socket
+from concurrent import futures
 
 import grpc
 import numpy as np
@@ -167,3 +168,38 @@ def test_nobody_there_is_told_in_time(make_client):
     client = make_client(f"127.0.0.1:{free_port()}")
     with pytest.raises(errors.Unreachable, match="no service answers at 127"):
         client.scenes.list(timeout_s=1.0)
+
+
+class _Deadlines(grpc.GenericRpcHandler):
+    """Notes how long each call may take, s, and refuses it."""
+
+    def __init__(self):
+        self.found = {}
+
+    def service(self, details):
+        def refuse(_, context):
+            self.found[details.method.rpartition("/")[2]] = context.time_remaining()
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, "no")
+
+        return grpc.unary_unary_rpc_method_handler(refuse)
+
+
+def test_a_recording_is_finished_without_a_deadline_of_the_clients_own(make_client):
+    deadlines = _Deadlines()
+    server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[deadlines])
+    client = make_client(f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}", timeout_s=30.0)
+    server.start()
+    calls = {
+        "GetRecording": lambda: client.recordings.get("liver"),
+        "FinishRecording": lambda: client.recordings.finish("liver"),
+        "DeleteRecording": lambda: client.recordings.delete("liver"),
+    }
+    for call in calls.values():
+        with pytest.raises(errors.InvalidArgument):
+            call()
+    own = {name for name, seconds in deadlines.found.items() if seconds is not None and seconds < 60.0}
+    assert (set(deadlines.found), own) == (set(calls), {"GetRecording", "DeleteRecording"})
+    with pytest.raises(errors.InvalidArgument):
+        client.recordings.finish("liver", timeout_s=20.0)
+    assert deadlines.found["FinishRecording"] < 60.0
+    server.stop(None)

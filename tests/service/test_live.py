@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,6 +115,28 @@ def test_over_a_websocket_bad_frames_are_told_and_the_others_go_on(service, http
     assert [(one["refused_number"], one["error"]["field"]) for one in answers if one["error"]] == [(1, "image")]
 
 
+def test_a_frame_that_cannot_be_read_is_told_with_its_own_number(service, http, begun):
+    sheared, nameless = np.eye(4), message_of(5, pose=np.zeros((4, 4))).replace(b'"number": 5', b'"number":-5')
+    sheared[0, 1] = 0.5
+    heads = {4: {"number": 4}, 6: {"number": 6, "pose": None}, None: ["number"]}
+    texts = {number: json.dumps(head).encode() for number, head in heads.items()}
+    bad = {number: len(text).to_bytes(4, "little") + text + b"image" for number, text in texts.items()}
+    with connect(f"{service.http.replace('http', 'ws', 1)}/v1/recordings/{begun}/stream") as socket:
+        for message in (message_of(3, pose=sheared), *bad.values(), nameless, b"\1\0", "hello", message_of(7), ""):
+            socket.send(message)
+        answers = [json.loads(answer) for answer in socket]
+    assert [one["refused_number"] for one in answers if one["error"]] == [3, 4, 6, *[None] * 4]
+    assert answers[-1]["recording"]["frames"] == 1
+
+
+def test_the_client_is_told_which_pose_is_none(client, begun):
+    lost = [replace(frame_of(number), pose=np.full((4, 4), np.nan)) for number in (2, 5)]
+    frames = [frame_of(0), frame_of(1), lost[0], frame_of(3), frame_of(4), lost[1]]  # the last one is not stored either
+    answers = list(client.recordings.record(begun, frames))
+    assert [one.error.sequence for one in answers if one.error is not None] == [2, 5]
+    assert answers[-1].recording.frames == 4
+
+
 def test_the_client_records_what_an_iterator_gives_and_goes_on_later(client, begun):
     first = list(client.recordings.record(begun, map(frame_of, range(4))))
     assert first[-1].recording.frames == 4
@@ -125,6 +148,15 @@ def test_the_client_records_what_an_iterator_gives_and_goes_on_later(client, beg
     client.recordings.delete(begun)
     with pytest.raises(errors.DatasetNotFound):
         client.recordings.get(begun)
+
+
+def test_the_client_is_told_of_a_second_sweep_that_counts_from_0_again(client, begun):
+    list(client.recordings.record(begun, map(frame_of, range(4))))
+    second = (replace(frame_of(number), number=number - 4) for number in range(4, 7))
+    answers = list(client.recordings.record(begun, second))
+    told = [(one.error.sequence, one.error.field) for one in answers if one.error is not None]
+    assert told == [(0, "number"), (1, "number"), (2, "number")]
+    assert answers[-1].recording.frames == 4
 
 
 def test_a_service_that_is_killed_between_frames_loses_none_that_it_acknowledged(start_service, tmp_path):

@@ -239,6 +239,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".json"),
             reader="ultragray.datasets.released:read_released",
             files=("conf.json",),
+            options=("image_delay_ms",),
             is_folder=True,
             upload_check="ultragray.datasets.released:require_files_below",
         ),

@@ -1,8 +1,8 @@
 """conf.json of the released trainer: planes and width in centimetres, angle in degrees.
 
-Keys that start with `_` are comments; keys that an import does not need are ignored. Three keys are ours, and the
+Keys that start with `_` are comments; keys that an import does not need are ignored. Some keys are ours, and the
 released code ignores them: `image_height` and `image_width`, since an exported checkpoint comes without its training
-images, and `probe_kind`, "phased" for a fan that begins at the face.
+images, `probe_kind`, "phased" for a fan that begins at the face, and `times_file_train` and `times_file_val`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ultragray.geometry.probe import ConvexProbe, FloatArray, LinearProbe, Phase
 MAX_CONFIG_BYTES = 1 << 20
 WIDTH_KEY, ANGLE_KEY = "ultrasound_opening_width", "ultrasound_opening_angle"
 KIND_KEY = "probe_kind"
-FILE_KEYS = ("images_file_train", "poses_file_train", "images_file_val", "poses_file_val")
+FILE_KEYS = tuple(f"{kind}_file_{part}" for part in ("train", "val") for kind in ("images", "poses", "times"))
 
 
 @dataclass(frozen=True)

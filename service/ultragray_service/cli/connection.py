@@ -88,7 +88,7 @@ def _words(error: OSError) -> str:
 
 JSON = "application/json"
 _TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s
-_CHECK_TIMEOUT_S = 1800.0  # for the answer to an upload, which is checked first
+CHECK_TIMEOUT_S = 1800.0  # for the answer to an upload or the end of a recording, which is checked first
 _BLOCK_BYTES = 1 << 20
 _PAGE = 100
 
@@ -113,8 +113,10 @@ class Connection:
         self._tls = tls
         self._headers = {"Connection": "close"} | ({} if api_key is None else {"X-API-Key": api_key})
 
-    def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
-        with self.open(method, route, body) as answer:
+    def json(
+        self, method: str, route: str, body: Mapping[str, Any] | None = None, timeout_s: float = _TIMEOUT_S
+    ) -> Any:
+        with self.open(method, route, body, timeout_s=timeout_s) as answer:
             return self._document(self.whole(answer))
 
     def text(self, route: str) -> str:
@@ -143,11 +145,16 @@ class Connection:
         return found
 
     def open(
-        self, method: str, route: str, body: Mapping[str, Any] | None = None, accept: str = JSON
+        self,
+        method: str,
+        route: str,
+        body: Mapping[str, Any] | None = None,
+        accept: str = JSON,
+        timeout_s: float = _TIMEOUT_S,
     ) -> http.client.HTTPResponse:
         content = None if body is None else json.dumps(body, default=str).encode()
         headers = {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
-        return self._ask(method, route, content, headers, _TIMEOUT_S)
+        return self._ask(method, route, content, headers, timeout_s)
 
     def events(self, route: str, name: str) -> Iterator[Any]:
         """The JSON of the events of that name; ends with the stream, or where the service goes away."""
@@ -182,7 +189,7 @@ class Connection:
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
         with path.open("rb") as file:
             body = _Counted(file, path.name, count)
-            with self._ask("PUT", route, body, headers, _CHECK_TIMEOUT_S) as answer:
+            with self._ask("PUT", route, body, headers, CHECK_TIMEOUT_S) as answer:
                 return self._document(self.whole(answer)), answer.status == 201
 
     def post(self, route: str, body: bytes) -> Any:
@@ -353,11 +360,17 @@ class Resource:
 
         self._add("delete", delete, meaning)
 
-    def add_action(self, action: str, meaning: str, in_words: Callable[[dict[str, Any]], str]) -> None:
+    def add_action(
+        self,
+        action: str,
+        meaning: str,
+        in_words: Callable[[dict[str, Any]], str],
+        timeout_s: float = _TIMEOUT_S,
+    ) -> None:
         """A command that has the service do something with one, and tells `in_words` what came of it."""
 
         def act(connection: Connection, name: str, json: Json = False) -> None:
-            changed = connection.json("POST", route(self.kind, name, suffix=f":{action}"))
+            changed = connection.json("POST", route(self.kind, name, suffix=f":{action}"), timeout_s=timeout_s)
             tell(in_words(changed), changed, as_json=json)
 
         self._add(action, act, meaning)

@@ -15,7 +15,7 @@ import typer
 
 from ultragray.contract import to_dict
 from ultragray.datasets.source import SourceOptions
-from ultragray_service.cli.connection import Connection, route, with_connection
+from ultragray_service.cli.connection import CHECK_TIMEOUT_S, Connection, route, with_connection
 from ultragray_service.cli.jobs import follow
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING, read_dataset
@@ -98,7 +98,7 @@ def live(
         state = connection.json("GET", route("recordings", name))
         tell(f"{name} is open, with {state['frames']:,} frames", {"recording": state, "job": job}, as_json=json)
         return
-    record = connection.json("POST", route("recordings", name, suffix=":finish"))
+    record = connection.json("POST", route("recordings", name, suffix=":finish"), timeout_s=CHECK_TIMEOUT_S)
     told = f"{record['train_frames']} training and {record['val_frames']} held-out frames"
     job_id = "" if job is None else f"; the job {job['id']} ends its scene"
     tell(f"recorded {name}: {told}{job_id}", {"dataset": record, "job": job}, as_json=json)

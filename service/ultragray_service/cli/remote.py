@@ -28,7 +28,7 @@ from ultragray.samplers import Sampler
 from ultragray.scene.info import DEFAULT_WITHIN_MM, read_header
 from ultragray.scene.label_maps import parse_names, read_label_map, read_painted
 from ultragray.scene.recipes import read_recipe
-from ultragray_service.cli.connection import Connection, Resource, route, with_connection
+from ultragray_service.cli.connection import CHECK_TIMEOUT_S, Connection, Resource, route, with_connection
 from ultragray_service.cli.editing import (
     RECIPE_FIELDS,
     AskedEdits,
@@ -503,6 +503,7 @@ _recordings.add_action(
     lambda record: (
         f"recorded {record['name']}: {record['train_frames']} training and {record['val_frames']} held-out frames"
     ),
+    CHECK_TIMEOUT_S,
 )
 _recordings.add_delete("Give up a recording and its frames.")
 

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 from ultragray.contract import described
-from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Slots
@@ -46,6 +46,14 @@ class IncomingFrame:
 
 
 @dataclass(frozen=True)
+class RefusedFrame:
+    """A frame that cannot be recorded, and why."""
+
+    number: int | None  # as its sender told it
+    error: InvalidArgument
+
+
+@dataclass(frozen=True)
 class RecordingView(RecordingState):
     """How far a recording is. What it tells is stored."""
 
@@ -70,19 +78,23 @@ class RecordingStream:
         return _viewed(self._owners, self._writer.state)
 
     async def put(self, frame: IncomingFrame) -> None:
-        """Takes a frame; one whose number was stored or passed already is left out.
+        """Takes a frame; one that is sent again though it is stored is left out.
 
-        Raises InvalidArgument and its kinds for a frame that cannot be recorded, after which others can, and what
-        storing those before it has raised.
+        Raises InvalidArgument and its kinds for a frame that cannot be recorded, such as another one of a number that
+        was passed already, after which others can, and what storing those before it has raised.
         """
         self.require_stored()
         number = self._next_number if frame.number is None else frame.number
         if not 0 <= number <= MAX_NUMBER:
             raise InvalidArgument(f"number must be from 0 to {MAX_NUMBER}, got {number}", field="number")
         pixels = await asyncio.to_thread(self._writer.state.settings.pixels, frame.image)
-        self._waiting.append(RecordedFrame(number, frame.time_s, frame.pose, pixels))
+        recorded = RecordedFrame(number, frame.time_s, frame.pose, pixels)
+        if number < self._next_number:
+            await self._require_sent_again(recorded)
+            return
+        self._waiting.append(recorded)
         self._waiting_bytes += pixels.nbytes
-        self._next_number = max(self._next_number, number + 1)
+        self._next_number = number + 1
         if self._storing is None or self._storing.done():
             self._storing = asyncio.create_task(self._store())
         if self._waiting_bytes > MAX_WAITING_BYTES:
@@ -99,6 +111,16 @@ class RecordingStream:
         """Raises what storing a frame has raised, whatever it is."""
         if self._failure is not None:
             raise self._failure
+
+    async def _require_sent_again(self, frame: RecordedFrame) -> None:
+        await self.stored()
+        if not await asyncio.to_thread(self._writer.has, frame):
+            raise InvalidArgument(
+                f"number must be at least {self._next_number}, the next of this recording, got {frame.number} with a "
+                "frame that is not stored under it: a sweep goes on counting where the one before ended, or leaves "
+                "number out",
+                field="number",
+            )
 
     async def _store(self) -> None:
         try:
@@ -122,27 +144,27 @@ class RecordingAnswer:
 
 async def record(
     stream: RecordingStream,
-    receive: Callable[[], Awaitable[IncomingFrame | None]],  # None: the client has sent all
+    receive: Callable[[], Awaitable[IncomingFrame | RefusedFrame | None]],  # None: the client has sent all
     send: Callable[[RecordingAnswer], Awaitable[None]],
     draining: asyncio.Event,
 ) -> None:
     """Records what a client sends, to its end. Raises what storing raises, and Draining where the service stops."""
     sending = asyncio.Lock()
 
-    async def answer(number: int | None = None, error: UltragrayError | None = None) -> None:
+    async def answer(refused: RefusedFrame | None = None) -> None:
+        number, error = (None, None) if refused is None else (refused.number, Refusal.of(refused.error))
         async with sending:
-            await send(RecordingAnswer(stream.state, number, None if error is None else Refusal.of(error)))
+            await send(RecordingAnswer(stream.state, number, error))
 
     async def take() -> None:
-        while True:
-            number = None
+        while (frame := await receive()) is not None:
+            if isinstance(frame, RefusedFrame):
+                await answer(frame)
+                continue
             try:
-                if (frame := await receive()) is None:
-                    return
-                number = frame.number
                 await stream.put(frame)
             except InvalidArgument as error:
-                await answer(number, error)
+                await answer(RefusedFrame(frame.number, error))
 
     async def tell() -> None:
         while True:

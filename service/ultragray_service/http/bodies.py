@@ -460,6 +460,16 @@ def read_incoming_frame(body: bytes) -> IncomingFrame:
     return IncomingFrame(pose=head.pose.exact("pose"), image=image, number=head.number, time_s=head.time_s)
 
 
+def number_of_frame(body: bytes) -> int | None:
+    """The number of a real frame whose other parts cannot be read; None where it tells none, or not one."""
+    try:
+        head = json.loads(message_parts(body)[0])
+    except (InvalidArgument, ValueError, RecursionError):
+        return None
+    number = head.get("number") if isinstance(head, dict) else None
+    return number if type(number) is int and 0 <= number <= MAX_NUMBER else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class RegistrationBody(Registration):
     """A registration, and the scene that its poses lead into."""

@@ -24,7 +24,7 @@ from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit
 from ultragray_service.access.principals import Me, me
 from ultragray_service.core.editing import EditTarget, LabelTarget, RecipeTarget
 from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
-from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, record
+from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, RefusedFrame, record
 from ultragray_service.core.registrations import NamedRegistration
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
@@ -248,16 +248,17 @@ async def _record_frames(service: Service, requests: Any, context: Context) -> N
     if first is grpc.aio.EOF or first.WhichOneof("part") != "dataset":
         raise InvalidArgument("the first message must name the recording", field="dataset")
 
-    async def receive() -> IncomingFrame | None:
+    async def receive() -> IncomingFrame | RefusedFrame | None:
         if (message := await context.read()) is grpc.aio.EOF:
             return None
         frame = message.frame
-        return IncomingFrame(
-            pose=read_pose(frame.pose, "pose"),
-            image=frame.image,
-            number=frame.number if frame.HasField("number") else None,
-            time_s=frame.time_s if frame.HasField("time_s") else None,
-        )
+        number = frame.number if frame.HasField("number") else None
+        try:
+            pose = read_pose(frame.pose, "pose")
+        except InvalidArgument as error:
+            return RefusedFrame(number, error)
+        time_s = frame.time_s if frame.HasField("time_s") else None
+        return IncomingFrame(pose=pose, image=frame.image, number=number, time_s=time_s)
 
     async def send(answer: RecordingAnswer) -> None:
         await context.write(to_message(answer, recordings_pb2.RecordFramesResponse))

@@ -11,6 +11,7 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import read_released, write_released
+from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
@@ -153,6 +154,15 @@ def test_a_copied_folder_reads_its_own_files(layout):
         (lambda it: (it.folder / "images_train.npy").unlink(), r"conf\.json: images_file_train names .*not found"),
         (lambda it: it.configure(poses_file_val=None), r"conf\.json: it lacks poses_file_val"),
         (lambda it: it.configure(poses_file_val=3), r"conf\.json: poses_file_val must be a path"),
+        (
+            lambda it: [it.save("t.npy", np.arange(3)), it.configure(times_file_train="data/tiny/t.npy")],
+            r"t\.npy: times must be numbers \[4\], got int64 \[3\]",
+        ),
+        (
+            lambda it: [it.save("t.npy", [0.0, np.nan, 0.2, np.inf]), it.configure(times_file_train="data/tiny/t.npy")],
+            r"t\.npy: times must be finite, those of frames 1, 3 are not",
+        ),
+        (lambda it: it.configure(times_file_val="data/tiny/t.npy"), r"times_file_val names .*not found"),
         (lambda it: it.configure(ultrasound_far_plane=0.1), r"conf\.json: far_mm must be greater"),
         (lambda it: it.write("conf.json", b"{"), r"conf\.json: not JSON"),
         (lambda it: (it.folder / "conf.json").unlink(), r"conf\.json: no such file"),
@@ -176,6 +186,35 @@ def test_what_is_written_is_read_back(tmp_path, make_sweep, random_poses, probe,
     assert read.sha256 == dataset.sha256
     assert read.name == "here"
     assert len(read.val) == val_count
+
+
+def test_times_are_written_and_read_back(tmp_path, make_sweep):
+    sweep = make_sweep(7, times_s=np.arange(7) / 10)
+    write_released(Dataset("timed", sweep.select(range(5)), sweep.select([5, 6])), tmp_path / "timed")
+    read = read_released(tmp_path / "timed")
+    np.testing.assert_array_equal(read.train.times_s, sweep.times_s[:5])
+    np.testing.assert_array_equal(read.val.times_s, sweep.times_s[5:])
+    poses = np.load(tmp_path / "timed" / "poses_train.npy")
+    poses[1] = np.nan  # no pose
+    np.save(tmp_path / "timed" / "poses_train.npy", poses)
+    np.testing.assert_array_equal(read_released(tmp_path / "timed").train.times_s, sweep.times_s[[0, 2, 3, 4]])
+
+
+def test_a_delay_takes_the_poses_between_the_frames_of_both_parts(tmp_path, make_sweep):
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 1, 3] = np.arange(7)
+    sweep = make_sweep(7, poses=poses, times_s=np.arange(7) / 10)
+    write_released(Dataset("timed", sweep.select([0, 1, 3, 4, 6]), sweep.select([2, 5])), tmp_path / "timed")
+    read = load_dataset(tmp_path / "timed", SourceOptions(image_delay_ms="25"))
+    np.testing.assert_allclose(read.train.poses[:, 1, 3], [0.75, 2.75, 3.75, 5.75])  # none is known before the first
+    np.testing.assert_allclose(read.val.poses[:, 1, 3], [1.75, 4.75])
+    assert read.train.frame_numbers.tolist() == [1, 2, 3, 4]
+    assert "25 ms before the stamps" in read.train.notes[-1]
+
+
+def test_a_delay_needs_times(layout):
+    with pytest.raises(InvalidArgument, match=r"image_delay_ms is for recordings with times: .* has none"):
+        read_released(layout.folder, image_delay_ms="25")
 
 
 @pytest.mark.parametrize(

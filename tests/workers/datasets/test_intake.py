@@ -14,6 +14,7 @@ from ultragray.datasets.released import write_released
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers import claims
 from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
+from ultragray_workers.datasets.recording import RecordedFrame, RecordingSettings
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, UploadTooLarge
 
@@ -116,6 +117,21 @@ def test_warnings_of_the_check_are_kept(store, receive, files, tmp_path):
     take_in(**arguments(incoming))
     (warning,) = incoming.accept("tiny")[0].warnings
     assert warning.startswith("train: frames 3 are nearly black")
+
+
+def test_a_recording_is_checked_and_kept_with_the_times_of_its_frames(store, receive):
+    taken, times_s = sweep(20, 0.0), np.arange(20) / 10
+    times_s[12:] -= 0.75
+    store.recordings.begin("liver", RecordingSettings(taken.probe, taken.height, taken.width))
+    parts = zip(times_s.tolist(), taken.poses, taken.images, strict=True)
+    store.recordings.writer("liver").append([RecordedFrame(number, *part) for number, part in enumerate(parts)])
+    incoming = receive({})
+    take_in(**arguments(incoming, name="liver"), recorded=store.storage.location)
+    record, _ = incoming.accept("liver")
+    assert any("the time steps back" in warning for warning in record.warnings)
+    found = store.load("liver")
+    np.testing.assert_array_equal(found.val.times_s, times_s[2::5])
+    np.testing.assert_array_equal(found.train.times_s, np.delete(times_s, np.s_[2::5]))
 
 
 def test_scans_and_tables_of_poses_are_taken_in_with_what_belongs_to_them(store, receive, tmp_path):

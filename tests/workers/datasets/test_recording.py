@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,8 +58,19 @@ def test_frames_come_back_as_they_were_added(recordings):
 
 def test_a_writer_goes_on_where_one_that_died_has_left_off(recordings):
     recordings.writer("liver").append(frames(0, 1))
-    state = recordings.writer("liver").append(frames(1, 2))  # the sender did not learn that 1 was stored
+    state = recordings.writer("liver").append(frames(2))
     assert (state.frames, numbers_in(recordings)) == (3, [0, 1, 2])
+
+
+def test_a_writer_knows_the_very_frames_that_are_stored(recordings):
+    writer = recordings.writer("liver")
+    for numbers in ([1, 2], [4], [7, 8], [9]):
+        writer.append(frames(*numbers))
+    for known in (writer, recordings.writer("liver")):
+        assert [one.number for one in frames(*range(12)) if known.has(one)] == [1, 2, 4, 7, 8, 9]
+    (one,) = frames(7)
+    assert not writer.has(replace(one, pixels=one.pixels.T.reshape(one.pixels.shape)))
+    assert not writer.has(replace(one, pose=np.eye(4)))
 
 
 def test_a_block_that_was_cut_off_goes_and_its_frames_are_sent_again(recordings, tmp_path):
@@ -102,12 +115,52 @@ def test_a_recording_that_was_deleted_is_not_found(recordings, tmp_path):
     assert not list((tmp_path / "recording-blocks").rglob("0*"))
 
 
-def test_a_dataset_holds_every_fifth_frame_out_and_tells_what_was_lost(recordings):
-    recordings.writer("liver").append([*frames(0, 1, 2, 3, 5, 6, 7), *frames(90)])
+def test_a_dataset_holds_every_fifth_frame_out(recordings):
+    recordings.writer("liver").append(frames(*range(8)))
     dataset, remarks = recorded_dataset(recordings, "liver")
-    assert (len(dataset.train), len(dataset.val)) == (6, 2)
-    assert "83 frames were lost" in remarks[0]
-    assert "paused 1 times" in remarks[1]
+    assert (len(dataset.train), len(dataset.val), remarks) == (6, 2, ())
+
+
+@pytest.mark.parametrize(
+    ("numbers", "remarks"),
+    [
+        ([1, 2, 3], ["1 frame is missing, lost on the way or refused, before frame 1"]),
+        ([0, 1, 3, 4], ["1 frame is missing, lost on the way or refused, after frame 1"]),
+        ([6, 7, 9], ["7 frames are missing, lost on the way or refused, in 2 places, the first before frame 6"]),
+        (
+            [0, 1, 3, 90],
+            [
+                "87 frames are missing, lost on the way or refused, in 2 places, the first after frame 1",
+                "the recording paused once, for 9 s",
+            ],
+        ),
+        (
+            [0, 30, 90],
+            [
+                "88 frames are missing, lost on the way or refused, in 2 places, the first after frame 0",
+                "the recording paused 2 times, at most for 6 s",
+            ],
+        ),
+    ],
+)
+def test_what_is_missing_is_told(recordings, numbers, remarks):
+    recordings.writer("liver").append(frames(*numbers))
+    assert list(recorded_dataset(recordings, "liver")[1]) == remarks
+
+
+def test_the_dataset_has_the_times_of_the_frames(recordings):
+    recordings.writer("liver").append(frames(*range(8)))
+    dataset, _ = recorded_dataset(recordings, "liver")
+    np.testing.assert_allclose(dataset.train.times_s, [0.0, 0.1, 0.3, 0.4, 0.5, 0.6])
+    np.testing.assert_allclose(dataset.val.times_s, [0.2, 0.7])
+
+
+@pytest.mark.parametrize("time_s", [None, float("nan"), float("inf")])
+def test_a_dataset_has_no_times_where_a_frame_has_none(recordings, time_s):
+    first, *others = frames(*range(8))
+    recordings.writer("liver").append([replace(first, time_s=time_s), *others])
+    dataset, remarks = recorded_dataset(recordings, "liver")
+    assert (dataset.train.times_s, dataset.val.times_s, remarks) == (None, None, ())
 
 
 def test_a_recording_without_frames_is_no_dataset(recordings):
@@ -123,5 +176,11 @@ def test_pixels_come_as_grey_values_or_as_a_png_file():
         SETTINGS.pixels(png_file(frame.pixels[:8]))
     with pytest.raises(InvalidArgument, match="constant"):
         SETTINGS.pixels(bytes(16 * 12))
-    with pytest.raises(InvalidArgument, match="PNG"):
-        SETTINGS.pixels(b"nonsense")
+    with pytest.raises(InvalidArgument, match="must be a PNG"):
+        SETTINGS.pixels(b"\x89PNG, but not for long")
+
+
+@pytest.mark.parametrize("count", [0, 8, 16 * 12 - 1])
+def test_pixels_of_another_size_are_told_with_their_bytes(count):
+    with pytest.raises(InvalidArgument, match=rf"PNG file, or 16x12 = 192 bytes of grey pixels.* got {count} bytes"):
+        SETTINGS.pixels(bytes(count))

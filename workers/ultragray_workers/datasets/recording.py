@@ -11,9 +11,11 @@ power the last block may be cut off; the next writer removes it. `datasets.intak
 from __future__ import annotations
 
 import json
+import math
 import secrets
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +36,7 @@ from ultragray_workers.storage.storage import NotThere, Storage
 RECORDINGS, BLOCKS = "recordings", "recording-blocks"  # prefixes of keys
 FORMAT_VERSION = 1
 PAUSE_S = 2.0  # between frames; more is told as a pause
+_PNG = b"\x89PNG"
 _LENGTH_BYTES = 4  # before the JSON of a block, its length, the low byte first
 
 
@@ -54,10 +57,17 @@ class RecordingSettings(Contract):
     def pixels(self, image: bytes) -> ByteArray:  # [H, W]
         """The pixels of a frame as it came: grey ones of 8 bits, row by row, or a PNG file.
 
-        Raises InvalidArgument for a damaged file and for a frame in which every pixel is the same, InvalidImageSize.
+        Raises InvalidArgument for what is neither and for a frame in which every pixel is the same, InvalidImageSize.
         """
         height, width = self.image_height, self.image_width
-        pixels = read_grey(image, height, width) if len(image) == height * width else read_png(image)
+        is_raw = len(image) == height * width
+        if not is_raw and not image.startswith(_PNG):
+            raise InvalidArgument(
+                f"image must be a PNG file, or {height}x{width} = {height * width} bytes of grey pixels, as the "
+                f"recording was begun, got {len(image)} bytes that are neither",
+                field="image",
+            )
+        pixels = read_grey(image, height, width) if is_raw else read_png(image)
         if pixels.shape != (height, width):
             raise InvalidImageSize(
                 f"image must be {height}x{width}, as the recording was begun, got {pixels.shape[0]}x{pixels.shape[1]}",
@@ -187,65 +197,89 @@ class RecordingWriter:
             storage.delete(last)
             del sizes[last]
         self._count = len(sizes)
+        self._first_numbers: dict[int, int] = {}  # of blocks that were looked into
         self.state = RecordingState(name, header.settings, frames, next_number, sum(sizes.values()), header.created_at)
 
+    def has(self, frame: RecordedFrame) -> bool:
+        """Whether this very frame is stored: its number, with its pose and pixels.
+
+        Numbers rise from block to block, and within one.
+        """
+        after = bisect_right(range(self._count), frame.number, key=self._first_number)
+        found = _unpack(self._storage.read(_block_key(self._header, after - 1)), self._header.settings) if after else ()
+        return any(
+            one.number == frame.number
+            and np.array_equal(one.pose, frame.pose)
+            and np.array_equal(one.pixels, frame.pixels)
+            for one in found or ()
+        )
+
     def append(self, frames: Sequence[RecordedFrame], max_bytes: int | None = None) -> RecordingState:
-        """Stores frames in one block; those of numbers that are stored already, or passed, are left out.
+        """Stores frames, at least one, in one block. Their numbers rise, from `next_number` of the state on.
 
         Raises RecordingTaken where somebody else has added to the recording, UploadTooLarge beyond `max_bytes`.
         """
-        state, new = self.state, []
-        next_number = state.next_number
-        for frame in frames:
-            if frame.number >= next_number:
-                new.append(frame)
-                next_number = frame.number + 1
-        if not new:
-            return state
-        data = _pack(self._token, state.frames, new)
+        state = self.state
+        data = _pack(self._token, state.frames, frames)
         if max_bytes is not None and state.bytes + len(data) > max_bytes:
             raise UploadTooLarge(f"a recording may have at most {max_bytes} bytes", field="dataset")
         if not self._storage.write(_block_key(self._header, self._count), data, if_absent=True):
             raise RecordingTaken(f"somebody else records {state.name!r} as well: one may at a time", field="dataset")
         self._count += 1
-        self.state = RecordingState(
-            state.name,
-            state.settings,
-            state.frames + len(new),
-            next_number,
-            state.bytes + len(data),
-            state.created_at,
+        self.state = replace(
+            state,
+            frames=state.frames + len(frames),
+            next_number=frames[-1].number + 1,
+            bytes=state.bytes + len(data),
         )
         return self.state
+
+    def _first_number(self, block: int) -> int:
+        if block not in self._first_numbers:
+            told = _document(self._storage.read(_block_key(self._header, block)))
+            self._first_numbers[block] = told["frames"][0]["number"]
+        return self._first_numbers[block]
 
 
 def recorded_dataset(recordings: Recordings, name: str) -> tuple[Dataset, tuple[str, ...]]:
     """A recording as the data set that it becomes, every fifth frame held out, and what a person is to be told of it.
 
-    Raises DatasetNotFound, DatasetInvalid where there are too few frames.
+    It has the times of the frames where each has one. Raises DatasetNotFound, DatasetInvalid where there are too few
+    frames.
     """
     settings = recordings.settings(name)
     frames = [frame for block in recordings.frames(name) for frame in block]
     height, width = settings.image_height, settings.image_width
+    times = _times(frames)
     sweep = Sweep(
         np.stack([frame.pixels for frame in frames]) if frames else np.zeros((0, height, width), np.uint8),
         np.stack([frame.pose for frame in frames]) if frames else np.zeros((0, 4, 4)),
         settings.probe,
         np.arange(len(frames)),
         name,
+        times_s=np.array(times) if len(times) == len(frames) else None,
     )
     train, val = split_sequence(sweep, len(sweep), None, None)
     return Dataset(name, train, val), tuple(_remarks(frames))
 
 
+def _times(frames: Sequence[RecordedFrame]) -> list[float]:
+    """The times of the frames that have one, s; NaN and infinity are none."""
+    return [frame.time_s for frame in frames if frame.time_s is not None and math.isfinite(frame.time_s)]
+
+
 def _remarks(frames: Sequence[RecordedFrame]) -> Iterator[str]:
-    numbers = [-1, *(frame.number for frame in frames)]
-    if gaps := [(before, after - before - 1) for before, after in pairwise(numbers) if after - before > 1]:
-        lost = sum(count for _, count in gaps)
-        yield f"{lost:,} frames were lost on the way, in {len(gaps)} places, the first after frame {gaps[0][0]}"
-    times = [frame.time_s for frame in frames if frame.time_s is not None]
-    if pauses := [after - before for before, after in pairwise(times) if after - before > PAUSE_S]:
-        yield f"the recording paused {len(pauses)} times, for {max(pauses):.0f} s at most"
+    numbers = [-1, *(frame.number for frame in frames)]  # a sender counts from 0
+    if gaps := [(before, after) for before, after in pairwise(numbers) if after - before > 1]:
+        missing = sum(after - before - 1 for before, after in gaps)
+        before, after = gaps[0]
+        place = f"before frame {after}" if before < 0 else f"after frame {before}"
+        places = place if len(gaps) == 1 else f"in {len(gaps):,} places, the first {place}"
+        are_missing = "1 frame is missing" if missing == 1 else f"{missing:,} frames are missing"
+        yield f"{are_missing}, lost on the way or refused, {places}"
+    if pauses := [after - before for before, after in pairwise(_times(frames)) if after - before > PAUSE_S]:
+        paused = "once, for" if len(pauses) == 1 else f"{len(pauses):,} times, at most for"
+        yield f"the recording paused {paused} {max(pauses):.0f} s"
 
 
 def _key(name: str) -> str:

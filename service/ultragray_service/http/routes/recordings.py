@@ -9,9 +9,9 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from starlette.requests import Request
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, RecordingView, record
+from ultragray_service.core.recordings import IncomingFrame, RecordingAnswer, RecordingView, RefusedFrame, record
 from ultragray_service.errors import Refusal, UnsupportedMediaType
-from ultragray_service.http.bodies import adapter_of, body_schema, read_incoming_frame, read_json_body
+from ultragray_service.http.bodies import adapter_of, body_schema, number_of_frame, read_incoming_frame, read_json_body
 from ultragray_service.http.dependencies import BINARY, ServiceDep, problems, require_uncompressed
 from ultragray_service.http.routes.datasets import DatasetName, Private
 from ultragray_service.http.routes.streams import serve_websocket
@@ -59,7 +59,7 @@ async def get_recording(service: ServiceDep, dataset: DatasetName) -> RecordingV
     "/{dataset}/frames", openapi_extra=_FRAME, responses=problems(401, 403, 404, 409, 413, 415, 422, 429, 503, 507)
 )
 async def add_frame(request: Request, service: ServiceDep, dataset: DatasetName) -> RecordingView:
-    """Adds a frame. It is stored when the answer comes; one whose number was stored already is left out."""
+    """Adds a frame. It is stored when the answer comes; one that is sent again though it is stored is left out."""
     service.life.require_serving()
     require_uncompressed(request)
     content_type = request.headers.get("content-type", FRAME_TYPE)
@@ -97,15 +97,19 @@ async def record_frames(websocket: WebSocket, dataset: str) -> None:
         await service.recordings.get(dataset)
         place.enter_context(service.limits.stream())
 
-    async def receive() -> IncomingFrame | None:
+    async def receive() -> IncomingFrame | RefusedFrame | None:
         received = await websocket.receive()
         if received["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(received.get("code", 1005))
         if received.get("text") == "":
             return None
         if (body := received.get("bytes")) is None:
-            raise InvalidArgument("messages must be binary, or an empty text at the end", field="body")
-        return read_incoming_frame(body)
+            error = InvalidArgument("messages must be binary, or an empty text at the end", field="body")
+            return RefusedFrame(None, error)
+        try:
+            return read_incoming_frame(body)
+        except InvalidArgument as error:
+            return RefusedFrame(number_of_frame(body), error)
 
     async def send(answer: RecordingAnswer) -> None:
         await websocket.send_text(adapter_of(RecordingAnswer).dump_json(answer).decode())
