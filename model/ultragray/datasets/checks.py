@@ -399,7 +399,9 @@ def _cuts(frames: _Frames, jumps: set[int]) -> Iterator[str]:
     usual_mm = usual_step(frames.steps_mm)
     is_moving = frames.steps_mm > REST * usual_mm
     usual = float(np.median(changes[is_moving] if is_moving.any() else changes))
-    for place in np.flatnonzero(changes > max(CUT_FACTOR * usual, SMALLEST_CUT)):
+    # Pictures of a smooth body change by the square of a step.
+    by_step = usual * np.maximum(frames.steps_mm / max(usual_mm, 1e-9), 1.0) ** 2
+    for place in np.flatnonzero(changes > np.maximum(CUT_FACTOR * by_step, SMALLEST_CUT)):
         is_single = place > 0 and past_one[place - 1] < changes[place] / 2
         is_slow = frames.steps_mm[place] <= 2 * usual_mm
         if place not in jumps and is_slow and not is_single:

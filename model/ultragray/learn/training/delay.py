@@ -26,7 +26,7 @@ LEAST_STEPS = 0.2  # a delay of a smaller share of the usual time is none
 
 def with_delay(
     poses: FloatArray,  # [F, 4, 4] mm
-    times_s: FloatArray,  # [F] ascending in each sweep
+    times_s: FloatArray,  # [F] ascending in each sweep, or the same again
     ranges: Sequence[range],
     delay_s: float,
 ) -> FloatArray:  # [F, 4, 4] mm
@@ -39,7 +39,8 @@ def with_delay(
         asked_s = own_s - delay_s
         first = np.clip(np.searchsorted(own_s, asked_s, side="right") - 1, 0, len(own) - 2)
         before, after = own[first], own[first + 1]
-        shares = (asked_s - own_s[first]) / (own_s[first + 1] - own_s[first])
+        spans_s = own_s[first + 1] - own_s[first]  # 0 of a time that comes twice
+        shares = np.divide(asked_s - own_s[first], spans_s, out=np.zeros(len(own)), where=spans_s > 0.0)
         moved = before + shares[:, None, None] * (after - before)
         moved[:, :3, :3] = blended(before[:, :3, :3], after[:, :3, :3], shares)
         found[frames.start : frames.stop] = moved

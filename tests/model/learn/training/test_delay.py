@@ -77,3 +77,10 @@ def test_a_calibration_that_is_off_is_found_where_sweeps_cross(found_paths):
     assert np.linalg.norm(left, axis=-1).mean() < 0.3 * np.linalg.norm(before, axis=-1).mean()
     np.testing.assert_array_equal(found_calibration(images, ranges), np.eye(4))
     np.testing.assert_array_equal(found_calibration(given, [range(60)]), np.eye(4))  # one sweep tells none
+
+
+def test_a_time_that_comes_twice_leaves_its_pose():
+    steady = poses_of(np.zeros((4, 3)), np.arange(4.0)[:, None] * [0.0, 1.0, 0.0])
+    moved = with_delay(steady, np.array([0.0, 0.1, 0.2, 0.2]), [range(4)], -0.1)
+    assert np.isfinite(moved).all()
+    np.testing.assert_allclose(moved[:2, 1, 3], [1.0, 3.0])
