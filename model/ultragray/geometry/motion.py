@@ -15,6 +15,7 @@ Positions and turns have shares of their own. The root of what is left of Σ |y 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,6 +34,7 @@ _ATTEMPTS = 1024  # that wait for their time: more poses than come in a second, 
 _MEMORY_S = 3.0  # after which a prediction that was tried counts 1/e
 _DOUBT = 2.0  # predictions that came to nothing, which are assumed before any was tried
 _GAP_S = 1.0  # without poses: the path begins anew
+_LATE = 3  # poses in a row that are older than the newest
 _MOST = np.array([30.0, np.radians(30.0)])  # mm, rad, that a pose is foretold to move
 _JUMP = np.array([30.0, np.radians(30.0)])  # mm, rad off a steady motion: a tracker's jump, likewise
 _RIDGE = 1e-9  # of the normal equations, whose weights are at most 1
@@ -56,12 +58,31 @@ class _Attempt(NamedTuple):
     motions: FloatArray  # [K, 2, 3] by each fit
 
 
+class Stamps:
+    """Times of the poses of a path, in seconds. They rise, but for a late pose now and then, and for a clock that is
+    set back.
+    """
+
+    def __init__(self) -> None:
+        self._newest_s = -math.inf
+        self._late = 0  # in a row
+
+    def begin_anew(self, time_s: float) -> bool:
+        """Takes the next time; whether the clock was set back: it lies far before the newest, or several in a row do."""
+        self._late = self._late + 1 if time_s < self._newest_s else 0
+        is_set_back = self._late >= _LATE or time_s < self._newest_s - _GAP_S
+        if is_set_back or not self._late:
+            self._newest_s, self._late = time_s, 0
+        return is_set_back
+
+
 class PathPredictor:
     """Poses [4, 4] (mm) of one path in, with their times in seconds of any clock; predictions out."""
 
     def __init__(self) -> None:
         self._degrees, self._spans = (grid.ravel() for grid in np.meshgrid(_DEGREES, _SPANS))  # [K] each
         self._pose = np.eye(4)  # the newest
+        self._stamps = Stamps()
         self._times_s: deque[float] = deque(maxlen=_POSES)
         self._places: deque[FloatArray] = deque(maxlen=_POSES)  # [2, 3] each: position, and turns added up
         self._attempts: deque[_Attempt] = deque(maxlen=_ATTEMPTS)
@@ -71,14 +92,19 @@ class PathPredictor:
         self._count = 0.0
 
     def observe(self, time_s: float, pose: FloatArray) -> None:
-        """Takes a measured pose. One that is not newer than the newest is left out."""
-        if not self._times_s:
+        """Takes a measured pose, in the place of another of the same time. A late one, older than the newest, is left
+        out.
+        """
+        if self._stamps.begin_anew(time_s) or not self._times_s:
             self._begin(time_s, pose)
             return
         after_s = time_s - self._times_s[-1]
-        if after_s <= 0.0:
+        if after_s < 0.0:
             return
         step = np.stack([pose[:3, 3] - self._pose[:3, 3], turns_of(self._pose[:3, :3].T @ pose[None, :3, :3])[0]])
+        if after_s == 0.0:
+            self._pose, self._places[-1] = pose, self._places[-1] + step
+            return
         if after_s > _GAP_S or self._is_jump(step, after_s):
             self._begin(time_s, pose)
             return
@@ -96,6 +122,7 @@ class PathPredictor:
         motions = self._motions(ahead_s)
         self._attempts.append(_Attempt(self._times_s[-1] + ahead_s, self._places[-1], motions))
         shares = np.clip(self._agreed / (self._foretold * (1.0 + _DOUBT / max(self._count, _TINY)) + _TINY), 0.0, 1.0)
+        shares[len(self._times_s) <= self._degrees] = 0.0  # of a path that has just begun anew
         left = self._moved - 2.0 * shares * self._agreed + shares**2 * self._foretold  # [K, 2]
         best, parts = left.argmin(axis=0), np.arange(2)
         shift, turn = shortened(shares[best, parts, None] * motions[best, parts], _MOST)

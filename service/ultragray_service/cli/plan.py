@@ -61,7 +61,7 @@ def plan(
         found = plan_views(GaussianScene.load(scene), settings, poses=listed, view=standard, start=begin)
     if output is not None and len(found.poses):
         write_whole(output, npy_bytes(found.poses))
-    tell(_in_words(found, settings.want), {name: _plain(one) for name, one in asdict(found).items()}, as_json=json)
+    tell(_in_words(found, settings), {name: _plain(one) for name, one in asdict(found).items()}, as_json=json)
     if not len(found.poses):
         raise typer.Exit(1)
 
@@ -70,12 +70,13 @@ def _plain(value: FloatArray | float) -> object:
     return value if isinstance(value, float) else value.tolist()
 
 
-def _in_words(found: ViewPlan, want: str) -> str:
+def _in_words(found: ViewPlan, asked: PlanSettings) -> str:
     if not len(found.poses):
-        return f"no pose in reach adds to the {want} of {found.before:.3f}"
+        way = "" if asked.path_mm is None else f" on a way of {asked.path_mm:g} mm"
+        return f"no pose in reach{way} adds to the {asked.want} of {found.before:.3f}"
     rows = [
         f"{'  '.join(f'{value:8.2f}' for value in pose[:3, 3])}   {gain:+.4f}"
         for pose, gain in zip(found.poses, found.gains, strict=True)
     ]
-    head = f"{len(rows)} views, {found.path_mm:.0f} mm: {want} {found.before:.3f} → {found.after:.3f}"
+    head = f"{len(rows)} views, {found.path_mm:.0f} mm: {asked.want} {found.before:.3f} → {found.after:.3f}"
     return "\n".join([head, "       x         y         z mm   gain", *rows])

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.motion import Stamps
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import blended, rotation_angles_deg
 from ultragray.learn.localization.pixels import EncodedFrame
@@ -69,6 +70,7 @@ class StreamPreview:
 
     def __init__(self, rendering: Rendering) -> None:
         self._rendering = rendering
+        self._stamps = Stamps()
         self._path: deque[tuple[float, FloatArray]] = deque(maxlen=_POSES)
         self._offset = np.eye(4)  # from where poses are to where the scene is like the real frames
         self._view: tuple[object, ...] = ()  # of the frames that the previewer has
@@ -86,7 +88,9 @@ class StreamPreview:
         return self._newest is not None
 
     def note(self, measured_s: float, pose: FloatArray) -> None:
-        """Takes a pose [4, 4] mm, in the scene. One that is not newer than the newest is left out."""
+        """Takes a pose [4, 4] mm, in the scene. A late one, not newer than the newest, is left out."""
+        if self._stamps.begin_anew(measured_s):
+            self._path.clear()
         if not self._path or measured_s > self._path[-1][0]:
             self._path.append((measured_s, pose))
 

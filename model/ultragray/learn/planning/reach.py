@@ -63,7 +63,7 @@ def poses_in_reach(
         if plane is not None:
             in_plane = _moved_into(plane, surface, made[::2], probe, asked)
             made = np.concatenate([in_plane, made[1::2]])
-        found.append(made[_allowed(skin, probe, made, box)])
+        found.append(made[_allowed(skin, probe, made, asked)])
         if sum(map(len, found)) >= CANDIDATES:
             break
     poses = np.concatenate(found)[:CANDIDATES]
@@ -161,9 +161,15 @@ def _moved_into(
     return _with_faces(faces[fits], rotations[fits], probe)
 
 
-def _allowed(skin: Skin, probe: Probe, poses: FloatArray, box: Box | None) -> BoolArray:  # [C]
+def _allowed(skin: Skin, probe: Probe, poses: FloatArray, asked: PlanSettings) -> BoolArray:  # [C]
     touching: BoolArray = Touch.of(skin, probe, poses, _LINES).shares >= LEAST_CONTACT
-    if box is None:
-        return touching
-    faces = _faces(poses, probe)
-    return touching & ((faces >= box[0]) & (faces <= box[1])).all(axis=1)
+    return touching & within_box(poses, probe, asked)
+
+
+def within_box(poses: FloatArray, probe: Probe, asked: PlanSettings) -> BoolArray:  # [C, 4, 4] mm -> [C]
+    """Whether the middle of the probe's face lies in the box that is asked for, if one is."""
+    if asked.box_mm is None:
+        return np.ones(len(poses), bool)
+    (low, high), faces = box_of(asked.box_mm, "box_mm"), _faces(poses, probe)
+    within: BoolArray = ((faces >= low) & (faces <= high)).all(axis=1)
+    return within

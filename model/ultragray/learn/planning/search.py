@@ -19,12 +19,13 @@ of as many views gains (Nemhauser, Wolsey and Fisher 1978), and gains that were 
 view whose bound is below a gain that is known need not be looked at (Minoux 1978). T ≤ 1 makes the gain without shadow
 such a bound, so that shadows are computed for few of the views. What was best first need not be so beside the others:
 so each view is then exchanged for one that gains more in its place, until there is none. With a limit on the way, views
-are taken by gain per mm of detour; for that choice there is no guarantee, and no exchange.
+are taken by gain per mm of detour, as long as one is within reach of it; for that choice there is no guarantee, and no
+exchange.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -38,8 +39,8 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import rotation_angles_deg
-from ultragray.learn.planning.reach import evenly_spread, poses_in_reach
-from ultragray.learn.planning.settings import MAX_LISTED, MAX_PATH_MM, PlanSettings, ViewPlan, box_of
+from ultragray.learn.planning.reach import evenly_spread, poses_in_reach, within_box
+from ultragray.learn.planning.settings import MAX_LISTED, PlanSettings, ViewPlan, box_of
 from ultragray.learn.sweep import IntArray, corner_distances_mm, spread_places
 from ultragray.rendering.derived import BEYOND_MM, GAPS_MM
 from ultragray.rendering.limits import UNLIMITED, Limits
@@ -231,10 +232,10 @@ def choose(
     views: int,
     *,
     shade: Callable[[int], None] = lambda view: None,
-    costs: FloatArray | None = None,  # [C], by which gains are divided; lowered
+    costs: FloatArray | None = None,  # [C], by which gains are divided; infinite: it cannot be had
     after_each: Callable[[int], None] = lambda view: None,
 ) -> tuple[list[int], list[float]]:
-    """The views with the largest gains in turn, and these gains, until none gains anything."""
+    """The views with the largest gains in turn, and these gains, until none that can be had gains anything."""
     costs = np.ones(len(worth)) if costs is None else costs
     bounds = (np.maximum(worth, best).mean(axis=1) - best.mean()).astype(np.float64)
     is_shaded = np.zeros(len(worth), bool)
@@ -248,7 +249,7 @@ def choose(
                 is_shaded[view] = True
             bounds[view] = np.maximum(worth[view] - best, 0.0).mean(dtype=np.float64)
             is_known[view] = True
-        if bounds[view] < LEAST_GAIN:
+        if bounds[view] < LEAST_GAIN or math.isinf(costs[view]):
             break
         chosen.append(view)
         gains.append(float(bounds[view]))
@@ -293,17 +294,20 @@ _STARTS = 8
 
 def shortest_path(steps_mm: FloatArray, from_start_mm: FloatArray | None) -> tuple[IntArray, float]:  # [K, K], [K]
     """An order of views that is short to travel, and the length of the way, from a start where one is given."""
-    count = len(steps_mm)
-    ways = np.zeros((count + 2, count + 2))  # to the views, the start and the end, which is anywhere
-    ways[:count, :count] = steps_mm
-    if from_start_mm is not None:
-        ways[count, :count] = ways[:count, count] = from_start_mm
-    if not count:
+    if not len(steps_mm):
         return np.zeros(0, np.int64), 0.0
-    firsts = spread_places(count, _STARTS)
+    ways, firsts = _with_ends(steps_mm, from_start_mm), spread_places(len(steps_mm), _STARTS)
     paths = [_improved(ways, _nearest_next(steps_mm, int(first))) for first in firsts]
     order, length_mm = min(paths, key=itemgetter(1))
     return order, length_mm
+
+
+def _with_ends(steps_mm: FloatArray, from_start_mm: FloatArray | None) -> FloatArray:  # [K, K], [K] -> [K + 2, K + 2]
+    """The steps between views, and behind these the start, which may be anywhere, and the end, which is."""
+    ways = np.pad(steps_mm, (0, 2))
+    if from_start_mm is not None:
+        ways[-2, :-2] = ways[:-2, -2] = from_start_mm
+    return ways
 
 
 def _nearest_next(steps_mm: FloatArray, first: int) -> IntArray:  # [K, K] -> [K]
@@ -330,6 +334,40 @@ def _improved(ways: FloatArray, order: IntArray) -> tuple[IntArray, float]:  # [
         order = np.concatenate([order[: part.start], order[part][::-1], order[part.stop :]])
 
 
+class Way:
+    """A way of at most `most_mm` through views that are added one by one, each where that makes it least longer."""
+
+    def __init__(self, corners: FloatArray, from_start_mm: FloatArray | None, most_mm: float) -> None:
+        """Among C candidates, by the corners of their images [C, K, 3] mm, from a start where one is given."""
+        self.views: list[int] = []  # in the order to travel
+        self.length_mm = 0.0
+        self.costs = np.zeros(len(corners))  # mm of each candidate's detour; infinite where it would be too long
+        self._corners, self._most_mm = corners, most_mm
+        self._from_start_mm = np.zeros(len(corners)) if from_start_mm is None else from_start_mm
+        self._to_views_mm = np.zeros((len(corners), 0))  # [C, K], these in their order
+        self._look()
+
+    def add(self, view: int) -> None:
+        place = int(self._detours_mm[view].argmin())
+        views = [*self.views[:place], view, *self.views[place:]]
+        to_view_mm = corner_distances_mm(self._corners, self._corners[view])
+        to_views_mm = np.insert(self._to_views_mm, place, to_view_mm, axis=1)
+        ways = _with_ends(to_views_mm[views], self._from_start_mm[views])
+        order, self.length_mm = _improved(ways, np.arange(len(views)))
+        self.views, self._to_views_mm = [views[place] for place in order], to_views_mm[:, order]
+        self._look()
+
+    def _look(self) -> None:
+        """Measures the detour to each candidate, at each place of the way [C, K + 1]."""
+        stops = np.column_stack([self._from_start_mm, self._to_views_mm, np.zeros(len(self._corners))])  # [C, K + 2]
+        begun = self._from_start_mm[self.views[:1]]
+        between = self._to_views_mm[self.views[:-1], np.arange(1, len(self.views))]
+        steps = np.concatenate([begun, between, np.zeros(1)])
+        self._detours_mm = stops[:, :-1] + stops[:, 1:] - steps
+        detours = np.maximum(self._detours_mm.min(axis=1), 0.0)
+        self.costs[:] = np.where(self.length_mm + detours <= self._most_mm, detours + _LEAST_DETOUR_MM, np.inf)
+
+
 def plan_views(
     scene: GaussianScene,
     asked: PlanSettings | None = None,
@@ -351,6 +389,8 @@ def plan_views(
 
     standard, begin = _single(scene, view, "view"), _single(scene, start, "start")
     plane = None
+    if standard is not None and asked.plane is not None:
+        raise InvalidArgument("view is a plane of its own: give view or plane, not both", field="plane")
     if standard is not None:
         plane = np.append(standard[:3, 1], standard[:3, 1] @ standard[:3, 3])
     elif asked.plane is not None:
@@ -362,6 +402,9 @@ def plan_views(
         candidates = scene.poses_at_rest(check_poses(poses))
         if not 1 <= len(candidates) <= MAX_LISTED:
             raise InvalidArgument(f"poses must be 1 to {MAX_LISTED}, got {len(candidates)}", field="poses")
+        candidates = candidates[within_box(candidates, probe, asked)]
+        if not len(candidates):
+            raise InvalidArgument("none of the poses has the middle of the probe's face within box_mm", field="box_mm")
     targets = Targets.of(at_rest, asked, standard, plane, candidates, probe)
     limits.check_flag()
     model, hardness = read_model(scene.info.confidence, len(recorded)), np.zeros(len(targets.points), np.float32)
@@ -381,11 +424,7 @@ def plan_views(
     before, worths = float(best.mean(dtype=np.float64)), worth_of(candidates, probe)
     corners = probe.corners_from(candidates)
     from_start = None if begin is None else corner_distances_mm(corners, probe.corners_from(begin[None]))
-    costs = np.full(len(candidates), MAX_PATH_MM) if from_start is None else from_start + _LEAST_DETOUR_MM
-
-    def after_each(view: int) -> None:
-        limits.check_flag()
-        np.minimum(costs, corner_distances_mm(corners, corners[view]) + _LEAST_DETOUR_MM, out=costs)
+    way = None if asked.path_mm is None else Way(corners, from_start, asked.path_mm)
 
     is_shaded = np.zeros(len(candidates), bool)
 
@@ -395,28 +434,19 @@ def plan_views(
             shade(worths[view], best, targets.points, candidates[view], probe, attenuation)
         is_shaded[view] = True
 
-    chosen, gains = choose(
-        worths,
-        best.copy(),
-        asked.views,
-        shade=shade_once,
-        costs=None if asked.path_mm is None else costs,
-        after_each=after_each,
-    )
-    if asked.path_mm is None:
+    if way is not None:
+        chosen, gains = choose(
+            worths, best.copy(), asked.views, shade=shade_once, costs=way.costs, after_each=way.add
+        )
+        order, path_mm = np.array([chosen.index(view) for view in way.views], np.int64), way.length_mm
+    else:
+        chosen, _ = choose(worths, best.copy(), asked.views, shade=shade_once)
         chosen = exchange(worths, best, chosen, shade=shade_once)
         ranks, gains = choose(worths[chosen], best, len(chosen))
         chosen = [chosen[rank] for rank in ranks]
-
-    def way(count: int) -> tuple[IntArray, float]:
-        some = corners[chosen[:count]]
-        begun = None if from_start is None else from_start[chosen[:count]]
-        return shortest_path(corner_distances_mm(some[:, None], some[None]), begun)
-
-    count = len(chosen)
-    if asked.path_mm is not None:  # as many of the first as it suffices for
-        count = bisect_right(range(1, count + 1), asked.path_mm, key=lambda count: way(count)[1])
-    order, path_mm = way(count)
+        some = corners[chosen]
+        steps_mm = corner_distances_mm(some[:, None], some[None])
+        order, path_mm = shortest_path(steps_mm, None if from_start is None else from_start[chosen])
     scale, least = 1.0, 0.0
     if asked.want == "confidence" and model is not None:
         scale, least = 1.0 - model.black_ms_ssim, model.black_ms_ssim
@@ -425,7 +455,7 @@ def plan_views(
         gains=scale * np.array(gains)[order],
         ranks=order,
         before=least + scale * before,
-        after=least + scale * (before + sum(gains[:count])),
+        after=least + scale * (before + sum(gains)),
         path_mm=path_mm,
     )
 
