@@ -89,7 +89,7 @@ def read_table_sweep(
     times_s = table.times_s()
     pictures, poses, has_pose, image_times_s = _matched(folder, table, poses, has_pose, times_s, delay_ns)
     count = len(pictures)
-    numbers = np.array(range(count) if frames is None else parse_frame_ranges(frames, count, option="frames"))
+    numbers = np.arange(count) if frames is None else np.array(parse_frame_ranges(frames, count, option="frames"))
     left_out, numbers = numbers[~has_pose[numbers]], numbers[has_pose[numbers]]
     if not len(numbers):
         raise DatasetInvalid(f"{table_path}: none of {count} pictures has a pose")
@@ -165,7 +165,10 @@ class _Table:
         rest = [line for line in lines[len(comments) :] if not line.lstrip().startswith("#")]
         if comments and (not rest or re.match(r"\s*[-+.\d]", rest[0])):
             rest = [comments[-1].lstrip("# "), *rest]
-        separator = next((one for one in ";\t," if rest and one in rest[0]), None)
+        if len(rest) < 2:
+            found = f"only one row, {rest[0]!r:.80}" if rest else "no rows"
+            raise DatasetInvalid(f"{path}: it must have a row of names and rows of numbers below it, it has {found}")
+        separator = next((one for one in ";\t," if one in rest[0]), None)
         try:
             cells = (line.split() for line in rest) if separator is None else csv.reader(rest, delimiter=separator)
             first, *rows = cells

@@ -175,6 +175,16 @@ def test_pictures_that_do_not_go_with_it(write):
         load_dataset(folder)
 
 
+@pytest.mark.parametrize(
+    ("text", "found"), [("", "no rows"), ("\n \n", "no rows"), ("time,x_mm\n", "only one row, 'time,x_mm'")]
+)
+def test_a_table_without_rows_is_one_clear_error(write, text, found):
+    folder = write("", [])
+    (folder / "poses.csv").write_text(text)
+    with pytest.raises(DatasetInvalid, match=rf"poses\.csv: it must have a row of names and rows of .* it has {found}"):
+        load_dataset(folder)
+
+
 def text_of(header, rows, separator, spell=repr):
     return "\n".join([header, *(separator.join(map(spell, row)) for row in rows)])
 
