@@ -7,6 +7,7 @@ ProbeToTracker · ImageToProbe.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
+from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before, times_of_all
 from ultragray.datasets.fan import (
     DeviceSet,
     FanGeometry,
@@ -90,7 +91,7 @@ def read_plus_sweep(
     known = None if device_set is None else read_device_set(device_set)
     way = _Way.of(stored, known, transform)
     numbers, transforms, left_out = way.of_frames(range(frame_count) if delay_ns else chosen)
-    times_s = _times(stored, numbers)
+    times_s, time_notes = _times(stored, numbers)
     pixel_mm = pixel_size_mm(transforms)
     check_pixel_mm(pixel_mm, min(stored.pixels.shape[1:3]), way.calibration_source)
     images = orient_frames(grey_frames(stored.pixels, str(path)), orientation, path)
@@ -127,6 +128,7 @@ def read_plus_sweep(
             *notes,
             *_odd_lengths(stored, calibration, pixel_mm),
             *shown.notes,
+            *time_notes,
             *delay_note(delay_ns),
         ),
         chain=way.chain,
@@ -143,15 +145,26 @@ def _field(stored: StoredSequence, name: str) -> str:
     return ""
 
 
-def _times(stored: StoredSequence, numbers: np.ndarray) -> FloatArray | None:  # [F]
-    """The times of frames, in seconds; None where one has none."""
+def _times(stored: StoredSequence, numbers: np.ndarray) -> tuple[FloatArray | None, tuple[str, ...]]:  # [F]
+    """The times of frames, in seconds, and what is to be told of them; None where one has none."""
+    notes: tuple[str, ...] = ()
     for key in _TIMES:
-        try:
-            times = np.array([float(stored.frame_fields[number][key]) for number in numbers])
-        except (KeyError, ValueError):
-            continue
-        return times if np.isfinite(times).all() else None
-    return None
+        if any(key in stored.frame_fields[number] for number in numbers):
+            times_s, why_none = times_of_all(
+                np.array([_number(stored.frame_fields[number].get(key)) for number in numbers])
+            )
+            if times_s is not None:
+                return times_s, ()
+            notes = notes or why_none
+    return None, notes
+
+
+def _number(text: str | None) -> float:
+    """NaN where it is none."""
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
-from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns
+from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns, times_of_all
 from ultragray.datasets.fan import tracked_sweep
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid, InvalidPose
@@ -103,6 +103,7 @@ def read_table_sweep(
             Link("sensor", "tracker", f"pose ({table.words(known)})", table_path.name, is_tracked=True),
         )
     )
+    chosen_s, time_notes = (None, ()) if image_times_s is None else times_of_all(image_times_s[numbers])
     images, pixel_notes = _read_pictures([pictures[number] for number in numbers])
     sweep = tracked_sweep(
         images,
@@ -114,8 +115,8 @@ def read_table_sweep(
         fan=fan,
         calibration=f"{calibration_name}: image_to_sensor",
         chain=chain,
-        notes=notes + pixel_notes,
-        times_s=None if image_times_s is None or not np.isfinite(image_times_s).all() else image_times_s[numbers],
+        notes=notes + pixel_notes + time_notes,
+        times_s=chosen_s,
     )
     return sweep, count
 

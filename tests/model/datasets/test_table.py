@@ -175,6 +175,15 @@ def test_pictures_that_do_not_go_with_it(write):
         load_dataset(folder)
 
 
+def test_rows_without_a_time_are_told(write):
+    rows = table(TIMES, PLACES, quaternions())
+    rows[4][0] = rows[7][0] = None
+    folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    (told,) = (note for note in load_dataset(folder).train.notes if "time" in note)
+    assert told.startswith("2 of 12 frames have no time that can be read")
+    assert load_dataset(folder, SourceOptions(frames="8:")).train.times_s is not None
+
+
 @pytest.mark.parametrize(
     ("text", "found"), [("", "no rows"), ("\n \n", "no rows"), ("time,x_mm\n", "only one row, 'time,x_mm'")]
 )
