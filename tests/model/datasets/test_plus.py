@@ -128,6 +128,21 @@ def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 
 
+@pytest.mark.parametrize("suffix", ["mha", "nrrd"])
+def test_fields_that_do_not_go_with_the_images_are_told_or_refused(tmp_path, plus_files, device_set, suffix):
+    stored, fields = plus_files.speckle(4, ROWS, COLUMNS), plus_files.tracked_fields(7)
+    write = getattr(plus_files, f"write_{suffix}")
+    sweep, count = read_plus_sweep(write(tmp_path / f"more.{suffix}", stored, fields), device_set=device_set)
+    assert (count, len(sweep)) == (4, 4)
+    assert sweep.notes[0] == "it has 4 images, but fields of frames beyond them, which are left out: 4, 5, 6 (3 in all)"
+    from_one = {key: value for key, value in plus_files.tracked_fields(5).items() if "Frame0000" not in key}
+    message = (
+        r"4 images must be counted from Seq_Frame0000, they go from Seq_Frame0001 to Seq_Frame0004: counted from 1"
+    )
+    with pytest.raises(DatasetInvalid, match=message):
+        read_plus_sweep(write(tmp_path / f"one.{suffix}", stored, from_one), device_set=device_set)
+
+
 def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(3)
     for frame, status in enumerate(("OK", "INVALID", "OK")):
