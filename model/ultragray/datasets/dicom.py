@@ -515,7 +515,8 @@ def _read_frames(
     if is_wide and (used := int(frames.max()).bit_length()) <= bits - UNUSED_BITS:
         said, surplus = (f"only {used} of the {bits} bits of its pixels are used",), max(0, used - 8)
     if surplus:
-        said = (*said, f"pixels of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
+        what, bits = ("colours", 8 + surplus) if interpretation == "PALETTE COLOR" else ("pixels", bits)
+        said = (*said, f"{what} of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
     grey = (frames >> surplus).astype(np.uint8) if is_wide else frames
     return 255 - grey if interpretation == "MONOCHROME1" else grey, said
 

@@ -431,7 +431,7 @@ class _ImageTimes:
         for number, message in _chosen_images(file, topic, numbers):
             header = message.decode().header
             frames[header.frame_id.lstrip("/")] += 1
-            self.without_stamp += time_of(header, 0) == 0
+            self.without_stamp += time_of(header, 0) == 0 != message.log_time_ns
             found.append((number, time_of(header, message.log_time_ns), message.log_time_ns))
         if len(frames) > 1:
             listed = " and ".join(f"{name!r} ({count} images)" for name, count in sorted(frames.items()))
@@ -490,7 +490,8 @@ def _why_none(times: _ImageTimes, delay_ns: int, way: Way) -> str:
 def _path_notes(times: _ImageTimes, way: Way) -> tuple[str, ...]:
     """What the times of writing tell of the two clocks."""
     if times.without_stamp:
-        return (f"{times.without_stamp} images have no stamp: taken for those of the time that they were written at",)
+        images = "1 image has" if times.without_stamp == 1 else f"{times.without_stamp} images have"
+        return (f"{images} no stamp: the time of writing is taken for it",)
     apart_ms = (way.written_ns - times.written_ns) / NS_PER_MS
     if abs(apart_ms) <= SLOW_PATH_NS / NS_PER_MS:
         return ()

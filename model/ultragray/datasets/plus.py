@@ -99,7 +99,7 @@ def read_plus_sweep(
     calibration, to_pixels = way.to_probe(numbers[0]), way.image_to_pixels(numbers[0])
     fan_geometry, notes = None if fan is None else parse_fan(fan), list(way.notes)
     box = parse_crop(crop, *size)
-    is_whole = crop is None
+    is_whole = crop is None and fan is None
     if crop is None and fan is None:
         fan_geometry, fan_notes = _fan_of(stored, known, calibration, to_pixels, pixel_mm)
         clip, clip_notes = _clip_of(known, to_pixels, size)

@@ -227,6 +227,7 @@ def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, d
     ours = plus_files.write_mha(tmp_path / "ours.mha", frames, plus_files.tracked_fields(2))
     sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
     expected, _ = read_plus_sweep(ours, device_set=device_set, fan=FAN)
+    assert not any("the whole image" in note for note in sweep.notes)
     assert sweep.probe == expected.probe == ConvexProbe(60.0, 10.0, 26.0)
     np.testing.assert_array_equal(sweep.images, expected.images)
     np.testing.assert_array_equal(sweep.poses, expected.poses)
