@@ -52,6 +52,7 @@ IMAGE, PROBE, WORLDS = "Image", "Probe", ("Reference", "Tracker", "World")
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
 _IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences call it
 _TIMES = ("Timestamp", "UnfilteredTimestamp")
+_NO_NUMBER = re.compile(r"(?i)nan|#ind")  # in a matrix: of a tracker that has lost the probe
 _DEPTH = re.compile(r"(?i).*depth_?(mm|cm)?")
 _PERSON = re.compile(r"(?i)(.*[^a-z])?(patient|subject|mrn|accession|birth).*")
 SAME_SPACING = 0.02  # relative
@@ -267,7 +268,9 @@ class _Way:
         for name, _ in self.steps:
             key = "To".join(name)
             if name not in self.fixed:
-                statuses[key] = fields.get(key + _STATUS, "OK") if key + _TRANSFORM in fields else "missing"
+                value, status = fields.get(key + _TRANSFORM), fields.get(key + _STATUS, "OK")
+                is_lost = status.upper() == "OK" and _NO_NUMBER.search(value or "") is not None
+                statuses[key] = "missing" if value is None else "NaN" if is_lost else status
         return ", ".join(f"{key} {status[:20]}" for key, status in statuses.items() if status.upper() != "OK")
 
 
@@ -392,7 +395,7 @@ def _together(
                     for name, key in zip(names, keys, strict=True)
                 ]
             except DatasetInvalid:
-                return None
+                continue
     return None
 
 

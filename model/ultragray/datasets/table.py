@@ -46,6 +46,7 @@ _QUATERNIONS = (
 )
 _EULER = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
 _BRACKETS = re.compile(r"\s*[\[(](.*)[\])]$")  # around a unit: "x [mm]"
+NO_NUMBER = ("", "null", "nan", "na", "n/a", "none", "-", "--", "missing")  # cells of a row without a pose
 LONGEST_STEP_S = 2.0  # from row to row: times without a unit that go further are no seconds
 
 
@@ -196,14 +197,14 @@ class _Table:
                 return [self.columns[name] for name in wanted], unit
         return None
 
-    def values(self, places: Sequence[int]) -> FloatArray:  # [N, K]; an empty cell is NaN
+    def values(self, places: Sequence[int]) -> FloatArray:  # [N, K]; a cell of NO_NUMBER is NaN
         found = np.full((len(self.rows), len(places)), np.nan)
         for number, row in enumerate(self.rows):
             try:
                 cells = [row[place].strip() if place < len(row) else "" for place in places]
                 if self.has_decimal_commas:
                     cells = [cell.replace(",", ".") for cell in cells]
-                found[number] = [float(cell) if cell and cell.lower() != "null" else np.nan for cell in cells]
+                found[number] = [np.nan if cell.lower() in NO_NUMBER else float(cell) for cell in cells]
             except ValueError:
                 raise DatasetInvalid(f"{self.path}: row {number + 2}: it must have numbers, got {row!r:.80}") from None
         return found
@@ -275,6 +276,8 @@ def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArra
     columns = table.quaternion() if turn is None else turn[0]
     turns = table.values(columns or [])
     has_pose: BoolArray = np.isfinite(np.concatenate([positions, turns], axis=1)).all(axis=1)
+    if turn is None:
+        has_pose &= turns.any(axis=1)  # a tracker that has lost the probe writes 0 0 0 0
     for number in np.flatnonzero(has_pose):
         x, y, z = positions[number].tolist()
         try:

@@ -124,6 +124,11 @@ def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
         "frames without a valid pose or image were left out: 1, 3, 5 (3 in all: ProbeToTracker INVALID in 1; "
         "ImageStatus INVALID in 1; ProbeToTracker missing in 1)"
     )
+    fields["Seq_Frame0000_ProbeToTrackerTransform"] = "nan " * 16
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(6, ROWS, COLUMNS), fields)
+    lost, _ = read_plus_sweep(path, device_set=device_set)
+    assert lost.frame_numbers.tolist() == [2, 4]
+    assert "ProbeToTracker NaN in 1" in lost.notes[0]
     assert "oriented" in sweep.notes[1]
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 
@@ -163,7 +168,7 @@ def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
 
     refused("frame 2: ProbeToTracker must .*mirrored", {key: plus_files.numbers(np.diag([1.0, 1, -1, 1]))})
     refused("frame 2: ProbeToTracker must .*rotation", {key: plus_files.numbers(np.diag([2.0, 2, 2, 1]))})
-    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "nan " * 16})
+    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "inf " * 16})
     refused("frame 2: ProbeToTracker must be sixteen finite", {key: "1 0 0"})
     refused("images must be B-mode .* RF_REAL", {"UltrasoundImageType": "RF_REAL"})
     refused("UltrasoundImageOrientation must be", {"UltrasoundImageOrientation": "AMF"})

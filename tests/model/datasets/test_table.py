@@ -119,10 +119,11 @@ def test_poses_between_rows_at_the_times_of_pictures(write):
     check(folder, SourceOptions(image_delay_ms="-35"), shift_s=-0.035)
 
 
-def test_rows_without_a_pose_are_left_out(write):
+@pytest.mark.parametrize("word", ["nan", "NULL", "NA", "N/A", "None", " - ", "MISSING"])
+def test_rows_without_a_pose_are_left_out(write, word):
     rows = table(TIMES, PLACES, quaternions())
     rows[4][1:4] = [None, None, None]
-    rows[8][4] = "nan"
+    rows[8][4] = word
     dataset = load_dataset(write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows))
     assert "pictures without a pose were left out: 4, 8 (2 in all)" in dataset.train.notes
     assert sorted([*dataset.train.frame_numbers, *dataset.val.frame_numbers]) == [0, 1, 2, 3, 5, 6, 7, 9, 10, 11]
@@ -173,6 +174,12 @@ def test_pictures_that_do_not_go_with_it(write):
     (folder / "frame_5.png").write_bytes(b"no picture")
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
         load_dataset(folder)
+
+
+def test_a_quaternion_of_zeros_is_no_pose(write):
+    rows = table(TIMES, PLACES, quaternions())
+    rows[5][4:] = [0.0, 0.0, 0.0, 0.0]
+    assert "pictures without a pose were left out: 5 (1 in all)" in load_dataset(write(NAMES, rows)).train.notes
 
 
 def test_rows_without_a_time_are_told(write):
