@@ -348,7 +348,11 @@ def _steps(
         if way := find_path(sources, pixels, world):
             return tuple(way)
     is_calibrated = any(part.endswith(IMAGE) for name in sources for part in name)
-    hint = " (say with transform which to take)" if is_calibrated else " (give the device set that holds ImageToProbe)"
+    reached = {frame for name in sources for frame in name if find_path(sources, pixels, frame)}
+    goes_on = any({*name} <= reached and not any(part.endswith(IMAGE) for part in name) for name in sources)
+    hint = " (say with transform which to take)" if goes_on else " (give the device set that holds ImageToProbe)"
+    if is_calibrated and not goes_on:
+        hint = f" ({pixels} leads to {', '.join(sorted(reached))} alone: has the probe another name in the sequence?)"
     raise DatasetInvalid(
         f"{stored.path}: no transforms lead from {pixels} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are "
         f"{known}{hint}"

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import cv2
@@ -86,15 +86,15 @@ def read_table_sweep(
     folder = table_path.parent
     known = _read_calibration(calibration or folder / CALIBRATION)
     table = _Table.read(table_path)
-    poses, has_pose = _poses(table, known)
+    poses, has_pose, angle_notes = _poses(table, known)
     times_s = table.times_s()
-    pictures, poses, has_pose, image_times_s = _matched(folder, table, poses, has_pose, times_s, delay_ns)
+    pictures, poses, has_pose, image_times_s, left_notes = _matched(folder, table, poses, has_pose, times_s, delay_ns)
     count = len(pictures)
     numbers = np.arange(count) if frames is None else np.array(parse_frame_ranges(frames, count, option="frames"))
     left_out, numbers = numbers[~has_pose[numbers]], numbers[has_pose[numbers]]
     if not len(numbers):
         raise DatasetInvalid(f"{table_path}: none of {count} pictures has a pose")
-    notes = delay_note(delay_ns)
+    notes = (*angle_notes, *left_notes, *delay_note(delay_ns))
     if len(left_out):
         notes += (f"pictures without a pose were left out: {frame_list(left_out)} ({len(left_out)} in all)",)
     calibration_name = (calibration or folder / CALIBRATION).name
@@ -268,8 +268,8 @@ class _Table:
         return DatasetInvalid(f"{self.path}: it lacks columns of {what}, it has {', '.join(self.columns)[:200]}")
 
 
-def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArray]:  # [N, 4, 4], [N]
-    """The pose of each row, and whether it has one."""
+def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArray, tuple[str, ...]]:
+    """The pose of each row, [N, 4, 4], whether it has one, [N], and what is odd about its angles."""
     places, unit, _ = table.position(known)
     positions = table.values(places) * LENGTHS[unit]
     turn, poses = table.euler(known), np.tile(np.eye(4), (len(table.rows), 1, 1))
@@ -289,7 +289,10 @@ def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArra
                 poses[number, :3, 3] = x, y, z
         except InvalidPose as error:
             raise DatasetInvalid(f"{table.path}: row {number + 2}: {error}") from error
-    return poses, has_pose
+    largest = float(np.abs(turns[has_pose]).max(initial=0.0)) if turn is not None and turn[1] == "rad" else 0.0
+    if largest > 2 * np.pi:
+        return poses, has_pose, (f"its angles in rad go up to {largest:.4g}, beyond a whole turn: are they degrees?",)
+    return poses, has_pose, ()
 
 
 def rotation_of_angles(angles: FloatArray, order: str) -> FloatArray:  # [3] rad about x, y, z -> [3, 3]
@@ -309,8 +312,9 @@ def _matched(
     has_pose: BoolArray,
     times_s: FloatArray | None,
     delay_ns: int,
-) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None]:
-    """The pictures, the pose of each and whether it is known, and their times."""
+) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None, tuple[str, ...]]:
+    """The pictures, the pose of each and whether it is known, their times, and which pictures have no row."""
+    notes: tuple[str, ...] = ()
     pictures = _pictures(folder)
     by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
     stamped = _Table.read(folder / TIMES) if (folder / TIMES).is_file() else None
@@ -318,9 +322,16 @@ def _matched(
     if files is None:
         _check_order(folder, pictures)
     else:
-        if missing := [name for name in files if name not in by_name]:
+        paths = [str(PurePosixPath(name.replace("\\", "/"))) for name in files]  # also ./a.png and images\a.png
+        if missing := [name for name, where in zip(files, paths, strict=True) if where not in by_name]:
             raise DatasetInvalid(f"{(stamped or table).path}: the picture {missing[0][:80]!r} was not found beside it")
-        pictures = [by_name[name] for name in files]
+        named = [by_name[where] for where in paths]
+        kept = {*named}
+        if unnamed := [path.name for path in pictures if path not in kept]:
+            listed = ", ".join(unnamed[:5]) + (", …" if len(unnamed) > 5 else "")
+            table_name = (stamped or table).path.name
+            notes = (f"pictures without a row in {table_name} were left out: {listed} ({len(unnamed)} in all)",)
+        pictures = named
     image_times_s = times_s if stamped is None else stamped.times_s()
     if stamped is None and len(pictures) != len(poses):
         raise DatasetInvalid(
@@ -328,7 +339,7 @@ def _matched(
             f"their times in {TIMES}"
         )
     if stamped is None and not delay_ns:
-        return pictures, poses, has_pose, times_s
+        return pictures, poses, has_pose, times_s, notes
     if times_s is None or image_times_s is None or not np.isfinite(image_times_s).all():
         raise DatasetInvalid(f"{table.path}: poses between its rows need a column time for rows and pictures")
     usable = has_pose & np.isfinite(times_s)
@@ -337,7 +348,7 @@ def _matched(
         raise DatasetInvalid(f"{table.path}: none of its rows has a pose and a time")
     track = PoseTrack(times_ns, poses[usable][places])
     found, known = track.at(_nanoseconds(image_times_s, times_s) - delay_ns)
-    return pictures, found, known, image_times_s
+    return pictures, found, known, image_times_s, notes
 
 
 def _nanoseconds(times_s: FloatArray, all_s: FloatArray) -> IntArray:

@@ -187,7 +187,7 @@ def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
         read_plus_sweep(path)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
-    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(say with transform which"):
+    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(Image leads to Probe alone: has the"):
         read_plus_sweep(path, device_set=device_set)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):

@@ -176,6 +176,24 @@ def test_pictures_that_do_not_go_with_it(write):
         load_dataset(folder)
 
 
+def test_pictures_without_a_row_are_told_and_names_may_begin_with_the_folder(write):
+    rows = [[*row, f"{'./' if number % 2 else ''}frame_{number}.png"] for number, row in enumerate(WHOLE)][:-2]
+    dataset = load_dataset(write(f"{NAMES},file", rows))
+    assert len(dataset.train) + len(dataset.val) == 10
+    assert (
+        "pictures without a row in poses.csv were left out: frame_10.png, frame_11.png (2 in all)"
+        in dataset.train.notes
+    )
+
+
+def test_angles_in_radians_beyond_a_whole_turn_are_told(write):
+    header = "time,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad,other"
+    for scale, count in ((1.0, 0), (180 / np.pi, 1)):
+        angles = scale * turned_by("ZYX", "rad")
+        notes = load_dataset(write(header, table(TIMES, PLACES, angles, TIMES), euler_order="ZYX")).train.notes
+        assert sum("beyond a whole turn: are they degrees?" in note for note in notes) == count
+
+
 def test_a_quaternion_of_zeros_is_no_pose(write):
     rows = table(TIMES, PLACES, quaternions())
     rows[5][4:] = [0.0, 0.0, 0.0, 0.0]
