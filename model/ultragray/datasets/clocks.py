@@ -87,6 +87,17 @@ def goes_to_and_fro_mm(positions: FloatArray) -> float:  # [N, 3]
     return one if one > SMALLEST_TO_AND_FRO_MM and two < one / 2 else 0.0
 
 
+def times_of_all(times_s: FloatArray) -> tuple[FloatArray | None, tuple[str, ...]]:  # [F]
+    """The times where every frame has one, else None, and what a person is told of that."""
+    missing = int((~np.isfinite(times_s)).sum())
+    if not missing:
+        return times_s, ()
+    return None, (
+        f"{missing} of {len(times_s)} frames {'has' if missing == 1 else 'have'} no time that can be read: those of "
+        "the others are not used either, so that neither a delay of the images nor odd clocks are found",
+    )
+
+
 def poses_before(
     poses: FloatArray,  # [F, 4, 4]
     times_s: FloatArray | None,  # [F]

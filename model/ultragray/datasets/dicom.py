@@ -4,12 +4,13 @@
 is the top centre of the region that shows the image (SequenceOfUltrasoundRegions, PS3.3 C.8.5.5), x along its rows of
 pixels, z down its columns. Of a convex or phased probe, whose fan on the screen is said in words, the origin is the
 apex, z the middle of the fan. Where a file has no regions, the whole image is the region and PixelSpacing its scale.
-The extra `dicom`.
+Files of our own exporter hold their probe, its geometry and the poses themselves. The extra `dicom`.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 import warnings
@@ -22,8 +23,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ultragray.contract import from_dict
 from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
 from ultragray.datasets.fan import parse_fan, tracked_sweep
+from ultragray.datasets.image_geometry import ImageGeometry, PixelGrid
 from ultragray.datasets.images import (
     MAX_PIXEL_BYTES,
     CropBox,
@@ -32,11 +35,12 @@ from ultragray.datasets.images import (
     parse_crop,
 )
 from ultragray.datasets.released import no_pose_note
-from ultragray.errors import DatasetInvalid, InvalidPose
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.poses import frames_with_pose, read_frame_poses
-from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.installation import missing_extra
 from ultragray.learn.sweep import ByteArray, Chain, IntArray, Link, Sweep, check_frame_poses, parse_frame_ranges
+from ultragray.rendering.display import Display
 
 POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels
@@ -50,7 +54,7 @@ GREY, RGB, YBR = (
 )
 INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  # samples of a pixel
 PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
-NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
+NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test|simulated|ultragray).*")
 GREY_LEVELS = 10  # by which the samples of a grey pixel may differ: of lossy JPEG they do
 OTHER = 0.02  # relative, by which two sizes of a pixel may differ
 UNUSED_BITS = 3  # which a scanner that says how many bits it stores does not leave
@@ -75,9 +79,15 @@ def read_dicom_sweep(
     """
     delay_ns = parse_delay_ns(image_delay_ms)
     header = _read_header(path)
-    shape = _shape(path, header, is_fan=fan is not None)
-    region, notes = _region(path, header, shape, crop)
-    poses, poses_path = _read_poses(path, shape[0])
+    own = _OwnExport.of(path, header)
+    if own is not None and fan is not None:
+        raise InvalidArgument(f"fan is not for {path.name}: it says its {own.probe} itself", field="fan")
+    shape = _shape(path, header, is_fan=fan is not None or own is not None)
+    if own is None:
+        region, notes = _region(path, header, shape, crop)
+        poses, poses_path = _read_poses(path, shape[0])
+    else:
+        poses, poses_path, notes = own.poses_of(path, shape[0]), path, own.notes(path)
     numbers, times_s = np.flatnonzero(frames_with_pose(poses)), _times(path, header, shape[0])
     notes += no_pose_note(numbers, shape[0], poses_path)
     poses = check_frame_poses(poses[numbers], numbers, str(poses_path))
@@ -90,7 +100,10 @@ def read_dicom_sweep(
     if not len(numbers):
         raise DatasetInvalid(f"{path}: none of its frames that were chosen has a pose in {poses_path.name}")
     stored, pixel_notes = _read_frames(path, header, shape, numbers)
-    notes += (*pixel_notes, *_header_notes(path, header), *delay_note(delay_ns))
+    notes += (*pixel_notes, *_header_notes(path, header, is_own=own is not None), *delay_note(delay_ns))
+    chosen_s = None if times_s is None else times_s[numbers]
+    if own is not None:
+        return replace(own.sweep(stored, poses, numbers, path, notes, crop), times_s=chosen_s), shape[0]
     chain = Chain(
         (
             Link("pixels", "region", region.source, path.name),
@@ -123,7 +136,7 @@ def read_dicom_sweep(
         calibration=f"{path}: {region.source}",
         chain=chain,
         notes=notes,
-        times_s=None if times_s is None else times_s[numbers],
+        times_s=chosen_s,
     )
     return sweep, shape[0]
 
@@ -138,17 +151,19 @@ def _times(path: Path, header: Any, count: int) -> FloatArray | None:  # [F] s
         return np.arange(count) * float(step_ms) / 1000 if step_ms and float(step_ms) > 0 else None
 
 
-def _header_notes(path: Path, header: Any) -> tuple[str, ...]:
+def _header_notes(path: Path, header: Any, *, is_own: bool) -> tuple[str, ...]:
     with _in_our_words(path):
         named = [name for name in PERSON if not NOBODY.fullmatch(str(header.get(name, "")))]
         is_burnt_in = str(header.get("BurnedInAnnotation", "")).upper() == "YES"
         slope, intercept = (float(header.get(f"Rescale{name}", one)) for name, one in (("Slope", 1), ("Intercept", 0)))
     is_rescaled = (slope, intercept) != (1.0, 0.0)
+    is_unnamed = not is_own and _transducer(path, header) is None
+    burnt_in = "annotations are burnt into its pixels" if is_own else "the file says that its pixels name a person"
     notes = (
-        "" if _transducer(path, header) is not None else "the file does not name its transducer: taken as a linear one",
+        "the file does not name its transducer: taken as a linear one" if is_unnamed else "",
         f"its values are stored times {slope:g} plus {intercept:g}: taken as stored" if is_rescaled else "",
         f"its header names a person ({', '.join(named)}): convert --anonymize leaves it out" if named else "",
-        "the file says that its pixels name a person (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
+        f"{burnt_in} (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
     )
     return tuple(note for note in notes if note)
 
@@ -192,6 +207,69 @@ def _read_header(path: Path) -> Any:
             raise DatasetInvalid(f"{path}: its data set is deflated, which is not read: save it in another syntax")
         with _BoundedFile(path) as file:
             return pydicom.dcmread(file, stop_before_pixels=True)
+
+
+@dataclass(frozen=True)
+class _OwnExport:
+    """What a file of our own exporter says of itself: its private elements, and its one region."""
+
+    probe: Probe
+    picture: PixelGrid
+    box: CropBox  # of the picture in the image: annotations may stand below it
+    stored_poses: bytes
+
+    @classmethod
+    def of(cls, path: Path, header: Any) -> _OwnExport | None:
+        """None of other files. Raises DatasetInvalid for elements that cannot be read."""
+        with _in_our_words(path):
+            from ultragray.exchange.exports.dicom import (
+                ORIGIN_ELEMENT,
+                POSES_ELEMENT,
+                PRIVATE_CREATOR,
+                PRIVATE_GROUP,
+            )
+
+            try:
+                block = header.private_block(PRIVATE_GROUP, PRIVATE_CREATOR)
+                poses, text = block[POSES_ELEMENT].value, block[ORIGIN_ELEMENT].value
+            except KeyError:
+                return None
+            origin, regions = json.loads(text), header.get("SequenceOfUltrasoundRegions", [])
+            if len(regions) != 1 or not _is_tissue(regions[0]):
+                raise DatasetInvalid(f"{path}: our own export must have one region in centimetres, got {len(regions)}")
+            probe, depth_mm = from_dict(Probe, origin["probe"]), from_dict(Display, origin["display"]).depth_mm
+            if depth_mm is not None:
+                probe = probe.ending_at(min(probe.far_mm, probe.face_depth_mm + depth_mm))
+            column, row = (10.0 * float(regions[0][f"ReferencePixelPhysicalValue{axis}"].value) for axis in "XY")
+            region = _read_region(path, regions[0])
+            return cls(probe, PixelGrid("mm", column, row, *region.pixel_mm), region.box, poses)
+
+    def poses_of(self, path: Path, count: int) -> FloatArray:  # [F, 4, 4]
+        """Raises DatasetInvalid where there are not as many as frames."""
+        expected = 16 * 8 * count
+        if len(self.stored_poses) != expected:
+            raise DatasetInvalid(
+                f"{path}: poses of {count} frames must have {expected} bytes, its private element has "
+                f"{len(self.stored_poses)}"
+            )
+        return np.frombuffer(self.stored_poses, "<f8").reshape(-1, 4, 4).astype(np.float64)
+
+    def notes(self, path: Path) -> tuple[str, ...]:
+        beside = ", ".join(one.name for one in _poses_beside(path))
+        return (f"{beside} beside the file is not read: it holds its poses itself",) if beside else ()
+
+    def sweep(
+        self,
+        images: ByteArray,  # [F, rows, columns]
+        poses: FloatArray,  # [F, 4, 4] mm
+        numbers: IntArray,
+        path: Path,
+        notes: tuple[str, ...],
+        crop: str | None,
+    ) -> Sweep:
+        inner = images[:, self.box.top : self.box.bottom, self.box.left : self.box.right]
+        sweep = ImageGeometry(self.probe, self.picture).sweep(inner, poses, numbers, path, notes, crop)
+        return replace(sweep, chain=Chain((Link("Probe", "Tracker", "pose", path.name, is_tracked=True),)))
 
 
 def _value(path: Path, header: Any, name: str) -> Any:
@@ -356,12 +434,16 @@ def _is_tissue(region: Any) -> bool:
     return region.get("RegionSpatialFormat") == TISSUE_2D and units == (CENTIMETRES, CENTIMETRES)
 
 
+def _poses_beside(path: Path) -> list[Path]:
+    named = (path.with_name(f"{path.stem}{suffix}") for suffix in POSE_SUFFIXES)
+    return [file for file in named if file.is_file()]
+
+
 def _read_poses(path: Path, count: int) -> tuple[FloatArray, Path]:  # [F, 4, 4]
     """The poses of all frames, NaN of those without one, and their file."""
-    named = [path.with_name(f"{path.name[: -len(path.suffix)]}{suffix}") for suffix in POSE_SUFFIXES]
-    found = [file for file in named if file.is_file()]
+    found = _poses_beside(path)
     if len(found) != 1:
-        wanted = " or ".join(file.name for file in named)
+        wanted = " or ".join(f"{path.stem}{suffix}" for suffix in POSE_SUFFIXES)
         raise DatasetInvalid(f"{path}: the poses of its frames must lie beside it in {wanted}, found {len(found)}")
     try:
         poses = read_frame_poses(found[0])
@@ -433,7 +515,8 @@ def _read_frames(
     if is_wide and (used := int(frames.max()).bit_length()) <= bits - UNUSED_BITS:
         said, surplus = (f"only {used} of the {bits} bits of its pixels are used",), max(0, used - 8)
     if surplus:
-        said = (*said, f"pixels of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
+        what, bits = ("colours", 8 + surplus) if interpretation == "PALETTE COLOR" else ("pixels", bits)
+        said = (*said, f"{what} of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
     grey = (frames >> surplus).astype(np.uint8) if is_wide else frames
     return 255 - grey if interpretation == "MONOCHROME1" else grey, said
 

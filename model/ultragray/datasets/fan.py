@@ -364,7 +364,8 @@ def shown_frames(
     """The pixels in a box, or of a fan, of which nothing beyond the box is seen. Raises InvalidArgument."""
     inner = np.s_[:, box.top : box.bottom, box.left : box.right]
     if fan is None:
-        return ShownFrames(np.ascontiguousarray(images[inner]), top_centres, linear, box)
+        frames = np.ascontiguousarray(images[inner])
+        return ShownFrames(frames, top_centres, linear, box, _fan_note(frames) if len(frames) else ())
     size = images.shape[1], images.shape[2]
     if (box.height, box.width) != size:
         clipped = np.zeros_like(images)
@@ -375,6 +376,34 @@ def shown_frames(
     beyond = 1.0 - lines.share
     notes = (f"{beyond:.1%} of the fan lies beyond the image and is black",) if beyond > 1e-3 else ()
     return ShownFrames(lines.frames(images), poses, fan.probe(), lines.box, notes)
+
+
+BLACK = 16  # at most, of pixels beside a fan: compression leaves them not quite so
+UPPER, LOWER = 1 / 8, 1 / 32  # of the sides of an image: corners that are black beside a fan
+WIDENS = 0.9  # at most, the width at a quarter of its height over that at three quarters
+LEAST_SIDE = 64  # pixels of a picture whose outline can be told
+
+
+def _fan_note(frames: ByteArray) -> tuple[str, ...]:  # [F, rows, columns]
+    """A word about images that look like a fan: whatever any of them shows has its four corners cut and widens.
+
+    The outline is that of the largest connected part, so that text beside it does not count.
+    """
+    lit = (frames.max(axis=0) > BLACK).astype(np.uint8)
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(lit)
+    parts[0, cv2.CC_STAT_AREA] = 0  # all that is black
+    largest = int(parts[:, cv2.CC_STAT_AREA].argmax())
+    left, top, width, height, _ = map(int, parts[largest])
+    if largest == 0 or min(width, height) < LEAST_SIDE or width * height < lit.size / 4:
+        return ()
+    shape = labels[top : top + height, left : left + width] == largest
+    (up, across), (low, aside) = ((int(share * height), int(share * width)) for share in (UPPER, LOWER))
+    corners = shape[:up, :across], shape[:up, -across:], shape[-low:, :aside], shape[-low:, -aside:]
+    upper, lower = (np.ptp(np.flatnonzero(shape[row])) for row in (height // 4, 3 * height // 4))
+    middle = shape[:, width // 3 : 2 * width // 3]
+    if any(corner.any() for corner in corners) or middle.mean() < 0.5 or upper > WIDENS * lower:
+        return ()
+    return ("the corners of the images are black, as beside a fan: of a convex or phased probe, name it with fan",)
 
 
 def tracked_sweep(

@@ -90,7 +90,7 @@ class MessageFile:
                         self.broke_off = True
                         return
                     raise DatasetInvalid(
-                        f"{self.path}: it cannot be read as MCAP: {error or type(error).__name__}"
+                        f"{self.path}: it cannot be read as MCAP: {str(error) or 'it ends too early'}"
                     ) from error
                 is_begun = True
                 yield from inner

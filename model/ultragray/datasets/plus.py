@@ -7,6 +7,7 @@ ProbeToTracker · ImageToProbe.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
+from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before, times_of_all
 from ultragray.datasets.fan import (
     DeviceSet,
     FanGeometry,
@@ -51,6 +52,7 @@ IMAGE, PROBE, WORLDS = "Image", "Probe", ("Reference", "Tracker", "World")
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
 _IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences call it
 _TIMES = ("Timestamp", "UnfilteredTimestamp")
+_NO_NUMBER = re.compile(r"(?i)nan|#ind")  # in a matrix: of a tracker that has lost the probe
 _DEPTH = re.compile(r"(?i).*depth_?(mm|cm)?")
 _PERSON = re.compile(r"(?i)(.*[^a-z])?(patient|subject|mrn|accession|birth).*")
 SAME_SPACING = 0.02  # relative
@@ -90,7 +92,7 @@ def read_plus_sweep(
     known = None if device_set is None else read_device_set(device_set)
     way = _Way.of(stored, known, transform)
     numbers, transforms, left_out = way.of_frames(range(frame_count) if delay_ns else chosen)
-    times_s = _times(stored, numbers)
+    times_s, time_notes = _times(stored, numbers)
     pixel_mm = pixel_size_mm(transforms)
     check_pixel_mm(pixel_mm, min(stored.pixels.shape[1:3]), way.calibration_source)
     images = orient_frames(grey_frames(stored.pixels, str(path)), orientation, path)
@@ -98,7 +100,7 @@ def read_plus_sweep(
     calibration, to_pixels = way.to_probe(numbers[0]), way.image_to_pixels(numbers[0])
     fan_geometry, notes = None if fan is None else parse_fan(fan), list(way.notes)
     box = parse_crop(crop, *size)
-    is_whole = crop is None
+    is_whole = crop is None and fan is None
     if crop is None and fan is None:
         fan_geometry, fan_notes = _fan_of(stored, known, calibration, to_pixels, pixel_mm)
         clip, clip_notes = _clip_of(known, to_pixels, size)
@@ -127,6 +129,7 @@ def read_plus_sweep(
             *notes,
             *_odd_lengths(stored, calibration, pixel_mm),
             *shown.notes,
+            *time_notes,
             *delay_note(delay_ns),
         ),
         chain=way.chain,
@@ -143,15 +146,26 @@ def _field(stored: StoredSequence, name: str) -> str:
     return ""
 
 
-def _times(stored: StoredSequence, numbers: np.ndarray) -> FloatArray | None:  # [F]
-    """The times of frames, in seconds; None where one has none."""
+def _times(stored: StoredSequence, numbers: np.ndarray) -> tuple[FloatArray | None, tuple[str, ...]]:  # [F]
+    """The times of frames, in seconds, and what is to be told of them; None where one has none."""
+    notes: tuple[str, ...] = ()
     for key in _TIMES:
-        try:
-            times = np.array([float(stored.frame_fields[number][key]) for number in numbers])
-        except (KeyError, ValueError):
-            continue
-        return times if np.isfinite(times).all() else None
-    return None
+        if any(key in stored.frame_fields[number] for number in numbers):
+            times_s, why_none = times_of_all(
+                np.array([_number(stored.frame_fields[number].get(key)) for number in numbers])
+            )
+            if times_s is not None:
+                return times_s, ()
+            notes = notes or why_none
+    return None, notes
+
+
+def _number(text: str | None) -> float:
+    """NaN where it is none."""
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan
 
 
 @dataclass(frozen=True)
@@ -254,7 +268,9 @@ class _Way:
         for name, _ in self.steps:
             key = "To".join(name)
             if name not in self.fixed:
-                statuses[key] = fields.get(key + _STATUS, "OK") if key + _TRANSFORM in fields else "missing"
+                value, status = fields.get(key + _TRANSFORM), fields.get(key + _STATUS, "OK")
+                is_lost = status.upper() == "OK" and _NO_NUMBER.search(value or "") is not None
+                statuses[key] = "missing" if value is None else "NaN" if is_lost else status
         return ", ".join(f"{key} {status[:20]}" for key, status in statuses.items() if status.upper() != "OK")
 
 
@@ -332,7 +348,11 @@ def _steps(
         if way := find_path(sources, pixels, world):
             return tuple(way)
     is_calibrated = any(part.endswith(IMAGE) for name in sources for part in name)
-    hint = " (say with transform which to take)" if is_calibrated else " (give the device set that holds ImageToProbe)"
+    reached = {frame for name in sources for frame in name if find_path(sources, pixels, frame)}
+    goes_on = any({*name} <= reached and not any(part.endswith(IMAGE) for part in name) for name in sources)
+    hint = " (say with transform which to take)" if goes_on else " (give the device set that holds ImageToProbe)"
+    if is_calibrated and not goes_on:
+        hint = f" ({pixels} leads to {', '.join(sorted(reached))} alone: has the probe another name in the sequence?)"
     raise DatasetInvalid(
         f"{stored.path}: no transforms lead from {pixels} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are "
         f"{known}{hint}"
@@ -379,7 +399,7 @@ def _together(
                     for name, key in zip(names, keys, strict=True)
                 ]
             except DatasetInvalid:
-                return None
+                continue
     return None
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid
-from ultragray.learn.sweep import ByteArray
+from ultragray.learn.sweep import ByteArray, frame_list
 
 MAX_HEADER_BYTES = 256 << 20
 MAX_LINE_BYTES = 1 << 20
@@ -51,10 +51,10 @@ def header_lines(file: BinaryIO, path: Path) -> Iterator[str]:
 
 def split_fields(
     path: Path, entries: Mapping[str, str], frame_count: int
-) -> tuple[dict[str, str], tuple[Mapping[str, str], ...]]:
-    """The fields of the file, and those of each of its frames; fields of frames beyond them are left out.
+) -> tuple[dict[str, str], tuple[Mapping[str, str], ...], tuple[str, ...]]:
+    """The fields of the file, those of each of its frames, and what is to be told of fields beyond its frames.
 
-    Raises DatasetInvalid for a number of frames far beyond those that have fields.
+    Raises DatasetInvalid for a number of frames far beyond those that have fields, and for frames counted from 1.
     """
     fields: dict[str, str] = {}
     frames: dict[int, dict[str, str]] = {}
@@ -62,11 +62,23 @@ def split_fields(
         match = _FRAME_FIELD.fullmatch(key)
         if match is None:
             fields[key] = value
-        elif int(match[1]) < frame_count:
+        else:
             frames.setdefault(int(match[1]), {})[match[2]] = value
+    beyond = sorted(number for number in frames if number >= frame_count)
+    if beyond and 0 not in frames:
+        raise DatasetInvalid(
+            f"{path}: the fields of its {frame_count} images must be counted from Seq_Frame0000, they go from "
+            f"Seq_Frame{min(frames):04d} to Seq_Frame{beyond[-1]:04d}: counted from 1?"
+        )
     if frame_count > len(frames) + MAX_BARE_FRAMES:
         raise DatasetInvalid(f"{path}: its header says {frame_count} frames, but has fields of {len(frames)} only")
-    return fields, tuple(frames.get(number, {}) for number in range(frame_count))
+    notes: tuple[str, ...] = ()
+    if beyond:
+        notes = (
+            f"it has {frame_count} images, but fields of frames beyond them, which are left out: {frame_list(beyond)} "
+            f"({len(beyond)} in all)",
+        )
+    return fields, tuple(frames.get(number, {}) for number in range(frame_count)), notes
 
 
 def pixel_shape(path: Path, sizes: list[int], channels: int) -> tuple[int, ...]:  # [F, rows, columns(, channels)]
@@ -233,7 +245,7 @@ def read_meta_image(path: Path) -> StoredSequence:
             f"{path}: pixels must be binary {', '.join(_DTYPES)}, got ElementType "
             f"{entries.get('ElementType', 'missing')}"
         )
-    fields, frame_fields = split_fields(path, entries, shape[0])
+    fields, frame_fields, field_notes = split_fields(path, entries, shape[0])
     if entries.get("HeaderSize", "0") == "-1":
         offset = -1
     elif (header_size := number("HeaderSize", "0")) > 0:
@@ -242,7 +254,7 @@ def read_meta_image(path: Path) -> StoredSequence:
     deflated_bytes = number("CompressedDataSize", "0") or None
     order = ">" if any(map(flag, _MOST_SIGNIFICANT_FIRST)) else "<"
     pixels, notes = Payload(path, files, offset, order + dtype, deflated, deflated_bytes).read(shape)
-    return StoredSequence(path, pixels, fields, frame_fields, notes)
+    return StoredSequence(path, pixels, fields, frame_fields, (*field_notes, *notes))
 
 
 def _data_files(path: Path, value: str, following: Iterator[str]) -> tuple[str, ...]:
@@ -303,7 +315,7 @@ def read_nrrd(path: Path) -> StoredSequence:
         raise DatasetInvalid(
             f"{path}: over {MAX_SKIPPED_LINES} skipped lines, and a byte skip of compressed pixels, cannot be read"
         )
-    file_fields, frame_fields = split_fields(path, own, layout.shape[0])
+    file_fields, frame_fields, field_notes = split_fields(path, own, layout.shape[0])
     data_file = fields.get("data file", fields.get("datafile"))
     files = () if data_file is None else _data_files(path, data_file, iter(listed))
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
@@ -311,7 +323,7 @@ def read_nrrd(path: Path) -> StoredSequence:
     payload = Payload(path, files, begin, order + dtype, encoding != "raw", lines=lines)
     stored, notes = payload.read(layout.stored)
     pixels = np.ascontiguousarray(stored.transpose(layout.axes)).reshape(layout.shape)
-    return StoredSequence(path, pixels, file_fields, frame_fields, notes)
+    return StoredSequence(path, pixels, file_fields, frame_fields, (*field_notes, *notes))
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[dict[str, str], dict[str, str], list[str]]:

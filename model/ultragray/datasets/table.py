@@ -14,14 +14,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import cv2
 import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
-from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns
+from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns, times_of_all
 from ultragray.datasets.fan import tracked_sweep
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid, InvalidPose
@@ -46,6 +46,7 @@ _QUATERNIONS = (
 )
 _EULER = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
 _BRACKETS = re.compile(r"\s*[\[(](.*)[\])]$")  # around a unit: "x [mm]"
+NO_NUMBER = ("", "null", "nan", "na", "n/a", "none", "-", "--", "missing")  # cells of a row without a pose
 LONGEST_STEP_S = 2.0  # from row to row: times without a unit that go further are no seconds
 
 
@@ -85,15 +86,15 @@ def read_table_sweep(
     folder = table_path.parent
     known = _read_calibration(calibration or folder / CALIBRATION)
     table = _Table.read(table_path)
-    poses, has_pose = _poses(table, known)
+    poses, has_pose, angle_notes = _poses(table, known)
     times_s = table.times_s()
-    pictures, poses, has_pose, image_times_s = _matched(folder, table, poses, has_pose, times_s, delay_ns)
+    pictures, poses, has_pose, image_times_s, left_notes = _matched(folder, table, poses, has_pose, times_s, delay_ns)
     count = len(pictures)
-    numbers = np.array(range(count) if frames is None else parse_frame_ranges(frames, count, option="frames"))
+    numbers = np.arange(count) if frames is None else np.array(parse_frame_ranges(frames, count, option="frames"))
     left_out, numbers = numbers[~has_pose[numbers]], numbers[has_pose[numbers]]
     if not len(numbers):
         raise DatasetInvalid(f"{table_path}: none of {count} pictures has a pose")
-    notes = delay_note(delay_ns)
+    notes = (*angle_notes, *left_notes, *delay_note(delay_ns))
     if len(left_out):
         notes += (f"pictures without a pose were left out: {frame_list(left_out)} ({len(left_out)} in all)",)
     calibration_name = (calibration or folder / CALIBRATION).name
@@ -103,6 +104,7 @@ def read_table_sweep(
             Link("sensor", "tracker", f"pose ({table.words(known)})", table_path.name, is_tracked=True),
         )
     )
+    chosen_s, time_notes = (None, ()) if image_times_s is None else times_of_all(image_times_s[numbers])
     images, pixel_notes = _read_pictures([pictures[number] for number in numbers])
     sweep = tracked_sweep(
         images,
@@ -114,8 +116,8 @@ def read_table_sweep(
         fan=fan,
         calibration=f"{calibration_name}: image_to_sensor",
         chain=chain,
-        notes=notes + pixel_notes,
-        times_s=None if image_times_s is None or not np.isfinite(image_times_s).all() else image_times_s[numbers],
+        notes=notes + pixel_notes + time_notes,
+        times_s=chosen_s,
     )
     return sweep, count
 
@@ -165,7 +167,10 @@ class _Table:
         rest = [line for line in lines[len(comments) :] if not line.lstrip().startswith("#")]
         if comments and (not rest or re.match(r"\s*[-+.\d]", rest[0])):
             rest = [comments[-1].lstrip("# "), *rest]
-        separator = next((one for one in ";\t," if rest and one in rest[0]), None)
+        if len(rest) < 2:
+            found = f"only one row, {rest[0]!r:.80}" if rest else "no rows"
+            raise DatasetInvalid(f"{path}: it must have a row of names and rows of numbers below it, it has {found}")
+        separator = next((one for one in ";\t," if one in rest[0]), None)
         try:
             cells = (line.split() for line in rest) if separator is None else csv.reader(rest, delimiter=separator)
             first, *rows = cells
@@ -192,14 +197,14 @@ class _Table:
                 return [self.columns[name] for name in wanted], unit
         return None
 
-    def values(self, places: Sequence[int]) -> FloatArray:  # [N, K]; an empty cell is NaN
+    def values(self, places: Sequence[int]) -> FloatArray:  # [N, K]; a cell of NO_NUMBER is NaN
         found = np.full((len(self.rows), len(places)), np.nan)
         for number, row in enumerate(self.rows):
             try:
                 cells = [row[place].strip() if place < len(row) else "" for place in places]
                 if self.has_decimal_commas:
                     cells = [cell.replace(",", ".") for cell in cells]
-                found[number] = [float(cell) if cell and cell.lower() != "null" else np.nan for cell in cells]
+                found[number] = [np.nan if cell.lower() in NO_NUMBER else float(cell) for cell in cells]
             except ValueError:
                 raise DatasetInvalid(f"{self.path}: row {number + 2}: it must have numbers, got {row!r:.80}") from None
         return found
@@ -263,14 +268,16 @@ class _Table:
         return DatasetInvalid(f"{self.path}: it lacks columns of {what}, it has {', '.join(self.columns)[:200]}")
 
 
-def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArray]:  # [N, 4, 4], [N]
-    """The pose of each row, and whether it has one."""
+def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArray, tuple[str, ...]]:
+    """The pose of each row, [N, 4, 4], whether it has one, [N], and what is odd about its angles."""
     places, unit, _ = table.position(known)
     positions = table.values(places) * LENGTHS[unit]
     turn, poses = table.euler(known), np.tile(np.eye(4), (len(table.rows), 1, 1))
     columns = table.quaternion() if turn is None else turn[0]
     turns = table.values(columns or [])
     has_pose: BoolArray = np.isfinite(np.concatenate([positions, turns], axis=1)).all(axis=1)
+    if turn is None:
+        has_pose &= turns.any(axis=1)  # a tracker that has lost the probe writes 0 0 0 0
     for number in np.flatnonzero(has_pose):
         x, y, z = positions[number].tolist()
         try:
@@ -282,7 +289,10 @@ def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArra
                 poses[number, :3, 3] = x, y, z
         except InvalidPose as error:
             raise DatasetInvalid(f"{table.path}: row {number + 2}: {error}") from error
-    return poses, has_pose
+    largest = float(np.abs(turns[has_pose]).max(initial=0.0)) if turn is not None and turn[1] == "rad" else 0.0
+    if largest > 2 * np.pi:
+        return poses, has_pose, (f"its angles in rad go up to {largest:.4g}, beyond a whole turn: are they degrees?",)
+    return poses, has_pose, ()
 
 
 def rotation_of_angles(angles: FloatArray, order: str) -> FloatArray:  # [3] rad about x, y, z -> [3, 3]
@@ -302,8 +312,9 @@ def _matched(
     has_pose: BoolArray,
     times_s: FloatArray | None,
     delay_ns: int,
-) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None]:
-    """The pictures, the pose of each and whether it is known, and their times."""
+) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None, tuple[str, ...]]:
+    """The pictures, the pose of each and whether it is known, their times, and which pictures have no row."""
+    notes: tuple[str, ...] = ()
     pictures = _pictures(folder)
     by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
     stamped = _Table.read(folder / TIMES) if (folder / TIMES).is_file() else None
@@ -311,9 +322,16 @@ def _matched(
     if files is None:
         _check_order(folder, pictures)
     else:
-        if missing := [name for name in files if name not in by_name]:
+        paths = [str(PurePosixPath(name.replace("\\", "/"))) for name in files]  # also ./a.png and images\a.png
+        if missing := [name for name, where in zip(files, paths, strict=True) if where not in by_name]:
             raise DatasetInvalid(f"{(stamped or table).path}: the picture {missing[0][:80]!r} was not found beside it")
-        pictures = [by_name[name] for name in files]
+        named = [by_name[where] for where in paths]
+        kept = {*named}
+        if unnamed := [path.name for path in pictures if path not in kept]:
+            listed = ", ".join(unnamed[:5]) + (", …" if len(unnamed) > 5 else "")
+            table_name = (stamped or table).path.name
+            notes = (f"pictures without a row in {table_name} were left out: {listed} ({len(unnamed)} in all)",)
+        pictures = named
     image_times_s = times_s if stamped is None else stamped.times_s()
     if stamped is None and len(pictures) != len(poses):
         raise DatasetInvalid(
@@ -321,7 +339,7 @@ def _matched(
             f"their times in {TIMES}"
         )
     if stamped is None and not delay_ns:
-        return pictures, poses, has_pose, times_s
+        return pictures, poses, has_pose, times_s, notes
     if times_s is None or image_times_s is None or not np.isfinite(image_times_s).all():
         raise DatasetInvalid(f"{table.path}: poses between its rows need a column time for rows and pictures")
     usable = has_pose & np.isfinite(times_s)
@@ -330,7 +348,7 @@ def _matched(
         raise DatasetInvalid(f"{table.path}: none of its rows has a pose and a time")
     track = PoseTrack(times_ns, poses[usable][places])
     found, known = track.at(_nanoseconds(image_times_s, times_s) - delay_ns)
-    return pictures, found, known, image_times_s
+    return pictures, found, known, image_times_s, notes
 
 
 def _nanoseconds(times_s: FloatArray, all_s: FloatArray) -> IntArray:

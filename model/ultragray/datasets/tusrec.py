@@ -44,7 +44,7 @@ def read_tusrec_sweep(
     from_one[:2, 3] = 1.0  # pixel (1, 1) is the first
     image_to_tool = to_tool @ to_mm @ from_one
     stored, tforms, count = _read_scan(path, frames)
-    numbers = np.array(range(count) if frames is None else parse_frame_ranges(frames, count, option="frames"))
+    numbers = np.arange(count) if frames is None else np.array(parse_frame_ranges(frames, count, option="frames"))
     known = frames_with_pose(tforms)
     notes = no_pose_note(numbers[known], count, path) if frames is None else ()
     stored, numbers, tforms = stored[known], numbers[known], check_frame_poses(tforms[known], numbers[known], str(path))
@@ -121,6 +121,8 @@ def _read_scan(path: Path, frames: str | None) -> tuple[np.ndarray, FloatArray, 
                 raise DatasetInvalid(
                     f"{path}: tforms must be numbers [{count}, 4, 4], got {tforms.dtype} {list(tforms.shape)}"
                 )
+            if not count:
+                raise DatasetInvalid(f"{path}: it holds no frames, its frames are {list(images.shape)}")
             numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
             if images.dtype != np.uint8 or images.size * len(numbers) > MAX_PIXEL_BYTES * count:
                 raise DatasetInvalid(

@@ -175,7 +175,7 @@ def _read_object(path: Path) -> Mapping[str, Any]:
             raise CheckpointInvalid(f"{path}: no such file")
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise CheckpointInvalid(f"{path}: too large for a conf.json: over {MAX_CONFIG_BYTES} bytes")
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_bytes())  # of any encoding of Unicode, with a mark or none
     except (OSError, ValueError) as error:
         raise CheckpointInvalid(f"{path}: not JSON that can be read: {error}") from error
     except RecursionError as error:

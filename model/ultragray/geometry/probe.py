@@ -295,6 +295,7 @@ class Probe(Family):
 
     error: ClassVar[type[InvalidProbe]] = InvalidProbe
     usual_scan_lines_mm: ClassVar[tuple[float, float]] = (10.0, 400.0)  # their length
+    dicom_type: ClassVar[str | None] = None  # TransducerType (PS3.3 C.8.5.6); None: none of its terms fits
     kind: str
     near_mm: float  # depth at which the image begins
     far_mm: float  # and ends
@@ -463,6 +464,8 @@ class ConvexProbe(Fan):
     )
     kind: Literal["convex"] = kind_field("convex")
 
+    dicom_type = "CURVED LINEAR"
+
 
 USUAL_WIDTHS_MM = (5.0, 200.0)
 
@@ -476,6 +479,7 @@ class LinearProbe(Probe):
     far_mm: float = length_field("Depth at which the image ends, beyond `near_mm`.", above=0.0, example=50.0)
     kind: Literal["linear"] = kind_field("linear")
 
+    dicom_type = "LINEAR"
     face_depth_mm = 0.0
 
     @property
@@ -496,6 +500,7 @@ class PhasedProbe(Fan):
     far_mm: float = length_field("Depth at which the image ends.", above=0.0, example=50.0)
     kind: Literal["phased"] = kind_field("phased")
 
+    dicom_type = "SECTOR_PHASED"
     near_mm = 0.0
 
 
@@ -549,6 +554,7 @@ class SteeredProbe(Probe):
     )
     kind: Literal["steered"] = kind_field("steered")
 
+    dicom_type = "LINEAR"
     face_depth_mm = 0.0
 
     @property

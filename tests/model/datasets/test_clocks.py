@@ -136,6 +136,22 @@ def test_a_sequence_names_its_clock(tmp_path, plus_files, device_set):
         read_plus_sweep(path, device_set=device_set, image_delay_ms="5000")
 
 
+@pytest.mark.parametrize("odd", [None, "nan", "12:30:05", ""])
+def test_times_that_are_lost_for_one_frame_are_told(tmp_path, plus_files, device_set, odd):
+    fields = plus_files.tracked_fields(6) | {f"Seq_Frame{n:04d}_Timestamp": str(0.1 * n) for n in range(6)}
+    fields["Seq_Frame0003_Timestamp"] = odd
+    fields = {key: value for key, value in fields.items() if value is not None}
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(6, 20, 20), fields)
+    sweep, _ = read_plus_sweep(path, device_set=device_set)
+    assert sweep.times_s is None
+    (told,) = (note for note in sweep.notes if "time" in note)
+    assert told.startswith("1 of 6 frames has no time that can be read: those of the others are not used either")
+    assert "delay" in told
+    sweep, _ = read_plus_sweep(path, device_set=device_set, frames="4:")
+    np.testing.assert_allclose(sweep.times_s, [0.4, 0.5])
+    assert not any("time" in note for note in sweep.notes)
+
+
 @pytest.mark.parametrize("text", ["fast", "nan", "inf", "1e13"])
 def test_a_delay_must_be_milliseconds(text):
     with pytest.raises(InvalidArgument, match="image_delay_ms must be milliseconds"):

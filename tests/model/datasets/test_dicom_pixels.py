@@ -241,7 +241,9 @@ def test_a_palette(write):
         luts[f"{name}PaletteColorLookupTableDescriptor"] = [256, 0, 16]
         luts[f"{name}PaletteColorLookupTableData"] = (table[:, channel].astype("<u2") * 257).tobytes()
     path = write(PhotometricInterpretation="PALETTE COLOR", data=indices.tobytes(), **luts)
-    assert np.abs(load_dataset(path).val.images - luma(table[indices])[[2, 7]]).max() <= 1
+    sweep = load_dataset(path).val
+    assert np.abs(sweep.images - luma(table[indices])[[2, 7]]).max() <= 1
+    assert sweep.notes[1:] == ("colours of 16 bits were made 8: 65535 became 255",)
 
 
 def test_more_bits_are_made_eight(write):

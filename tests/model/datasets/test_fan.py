@@ -65,6 +65,18 @@ def test_its_pose_is_that_of_the_apex(tmp_path, plus_files, device_set):
         np.testing.assert_allclose(sweep.poses[0] @ in_probe, plain.poses[0] @ top_centre, atol=1e-9)
 
 
+def test_images_that_look_like_a_fan_are_told(tmp_path, plus_files, device_set):
+    """With text beside it; not an image with dark margins, nor one whose fan is named."""
+    fan = screen(of_both, (149.5, -100.0))
+    fan[:4, 100:140] = fan[10:20, 5:60] = 90
+    rectangle = np.full_like(fan, 7)
+    rectangle[:-20, 50:-50] = 80
+    for stored, options, expected in ((fan, {}, 1), (rectangle, {}, 0), (fan, {"fan": "60,10,26,149.5,-100"}, 0)):
+        path = plus_files.write_mha(tmp_path / "s.mha", np.stack([stored] * 2), plus_files.tracked_fields(2))
+        sweep, _ = read_plus_sweep(path, device_set=device_set, **options)
+        assert sum("corners of the images are black" in note for note in sweep.notes) == expected
+
+
 def test_a_fan_from_a_point_is_a_phased_probe(tmp_path, plus_files, device_set):
     path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
     dataset = load_dataset(path, SourceOptions(device_set=device_set, fan="60,0,20,149.5,0"))

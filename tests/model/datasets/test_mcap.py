@@ -143,8 +143,17 @@ def test_the_time_of_writing_stands_for_a_stamp_that_is_missing(bag):
     check_whole(dataset)
     assert dataset.train.notes == (
         "51 poses of /pose have no stamp: taken for those of the time that they were written at",
-        f"{COUNT} images have no stamp: taken for those of the time that they were written at",
+        f"{COUNT} images have no stamp: the time of writing is taken for it",
     )
+
+
+def test_one_image_without_a_stamp_is_told_as_one(bag):
+    bag.poses()
+    for number in range(COUNT):
+        stamp_ns = image_time_ns(number) if number else 0
+        bag.write("/us/image", ros.IMAGE, image_message(image_at(number), stamp_ns), image_time_ns(number))
+    (note,) = load_dataset(bag.finish()).train.notes
+    assert note == "1 image has no stamp: the time of writing is taken for it"
 
 
 def test_messages_that_were_written_at_the_time_of_their_stamps_have_stamps(bag):
@@ -550,7 +559,7 @@ def test_files_that_are_no_mcap_or_damaged(path):
     with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: it cannot be read as MCAP"):
         load_dataset(path)
     path.write_bytes(b"")
-    with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: "):
+    with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: it cannot be read as MCAP: it ends too early"):
         load_dataset(path)
     whole = bytearray(recorded(path).read_bytes())
     whole[2000:2100] = bytes(100)

@@ -124,8 +124,28 @@ def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
         "frames without a valid pose or image were left out: 1, 3, 5 (3 in all: ProbeToTracker INVALID in 1; "
         "ImageStatus INVALID in 1; ProbeToTracker missing in 1)"
     )
+    fields["Seq_Frame0000_ProbeToTrackerTransform"] = "nan " * 16
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(6, ROWS, COLUMNS), fields)
+    lost, _ = read_plus_sweep(path, device_set=device_set)
+    assert lost.frame_numbers.tolist() == [2, 4]
+    assert "ProbeToTracker NaN in 1" in lost.notes[0]
     assert "oriented" in sweep.notes[1]
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
+
+
+@pytest.mark.parametrize("suffix", ["mha", "nrrd"])
+def test_fields_that_do_not_go_with_the_images_are_told_or_refused(tmp_path, plus_files, device_set, suffix):
+    stored, fields = plus_files.speckle(4, ROWS, COLUMNS), plus_files.tracked_fields(7)
+    write = getattr(plus_files, f"write_{suffix}")
+    sweep, count = read_plus_sweep(write(tmp_path / f"more.{suffix}", stored, fields), device_set=device_set)
+    assert (count, len(sweep)) == (4, 4)
+    assert sweep.notes[0] == "it has 4 images, but fields of frames beyond them, which are left out: 4, 5, 6 (3 in all)"
+    from_one = {key: value for key, value in plus_files.tracked_fields(5).items() if "Frame0000" not in key}
+    message = (
+        r"4 images must be counted from Seq_Frame0000, they go from Seq_Frame0001 to Seq_Frame0004: counted from 1"
+    )
+    with pytest.raises(DatasetInvalid, match=message):
+        read_plus_sweep(write(tmp_path / f"one.{suffix}", stored, from_one), device_set=device_set)
 
 
 def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(tmp_path, plus_files, device_set):
@@ -148,7 +168,7 @@ def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
 
     refused("frame 2: ProbeToTracker must .*mirrored", {key: plus_files.numbers(np.diag([1.0, 1, -1, 1]))})
     refused("frame 2: ProbeToTracker must .*rotation", {key: plus_files.numbers(np.diag([2.0, 2, 2, 1]))})
-    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "nan " * 16})
+    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "inf " * 16})
     refused("frame 2: ProbeToTracker must be sixteen finite", {key: "1 0 0"})
     refused("images must be B-mode .* RF_REAL", {"UltrasoundImageType": "RF_REAL"})
     refused("UltrasoundImageOrientation must be", {"UltrasoundImageOrientation": "AMF"})
@@ -167,7 +187,7 @@ def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
         read_plus_sweep(path)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
-    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(say with transform which"):
+    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(Image leads to Probe alone: has the"):
         read_plus_sweep(path, device_set=device_set)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):
@@ -212,6 +232,7 @@ def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, d
     ours = plus_files.write_mha(tmp_path / "ours.mha", frames, plus_files.tracked_fields(2))
     sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
     expected, _ = read_plus_sweep(ours, device_set=device_set, fan=FAN)
+    assert not any("the whole image" in note for note in sweep.notes)
     assert sweep.probe == expected.probe == ConvexProbe(60.0, 10.0, 26.0)
     np.testing.assert_array_equal(sweep.images, expected.images)
     np.testing.assert_array_equal(sweep.poses, expected.poses)

@@ -59,6 +59,13 @@ def layout(tmp_path, make_sweep):
     return made
 
 
+def test_a_conf_json_may_begin_with_a_byte_order_mark(layout):
+    text = (layout.folder / "conf.json").read_text()
+    for encoding in ("utf-8-sig", "utf-16"):
+        (layout.folder / "conf.json").write_text(text, encoding=encoding)
+        assert len(read_released(layout.folder).train) == 4
+
+
 def test_a_folder_or_its_conf_json(layout):
     dataset = read_released(layout.folder)
     assert dataset.name == "tiny"

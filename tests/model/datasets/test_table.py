@@ -119,10 +119,11 @@ def test_poses_between_rows_at_the_times_of_pictures(write):
     check(folder, SourceOptions(image_delay_ms="-35"), shift_s=-0.035)
 
 
-def test_rows_without_a_pose_are_left_out(write):
+@pytest.mark.parametrize("word", ["nan", "NULL", "NA", "N/A", "None", " - ", "MISSING"])
+def test_rows_without_a_pose_are_left_out(write, word):
     rows = table(TIMES, PLACES, quaternions())
     rows[4][1:4] = [None, None, None]
-    rows[8][4] = "nan"
+    rows[8][4] = word
     dataset = load_dataset(write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows))
     assert "pictures without a pose were left out: 4, 8 (2 in all)" in dataset.train.notes
     assert sorted([*dataset.train.frame_numbers, *dataset.val.frame_numbers]) == [0, 1, 2, 3, 5, 6, 7, 9, 10, 11]
@@ -172,6 +173,49 @@ def test_pictures_that_do_not_go_with_it(write):
         load_dataset(folder)
     (folder / "frame_5.png").write_bytes(b"no picture")
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
+        load_dataset(folder)
+
+
+def test_pictures_without_a_row_are_told_and_names_may_begin_with_the_folder(write):
+    rows = [[*row, f"{'./' if number % 2 else ''}frame_{number}.png"] for number, row in enumerate(WHOLE)][:-2]
+    dataset = load_dataset(write(f"{NAMES},file", rows))
+    assert len(dataset.train) + len(dataset.val) == 10
+    assert (
+        "pictures without a row in poses.csv were left out: frame_10.png, frame_11.png (2 in all)"
+        in dataset.train.notes
+    )
+
+
+def test_angles_in_radians_beyond_a_whole_turn_are_told(write):
+    header = "time,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad,other"
+    for scale, count in ((1.0, 0), (180 / np.pi, 1)):
+        angles = scale * turned_by("ZYX", "rad")
+        notes = load_dataset(write(header, table(TIMES, PLACES, angles, TIMES), euler_order="ZYX")).train.notes
+        assert sum("beyond a whole turn: are they degrees?" in note for note in notes) == count
+
+
+def test_a_quaternion_of_zeros_is_no_pose(write):
+    rows = table(TIMES, PLACES, quaternions())
+    rows[5][4:] = [0.0, 0.0, 0.0, 0.0]
+    assert "pictures without a pose were left out: 5 (1 in all)" in load_dataset(write(NAMES, rows)).train.notes
+
+
+def test_rows_without_a_time_are_told(write):
+    rows = table(TIMES, PLACES, quaternions())
+    rows[4][0] = rows[7][0] = None
+    folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    (told,) = (note for note in load_dataset(folder).train.notes if "time" in note)
+    assert told.startswith("2 of 12 frames have no time that can be read")
+    assert load_dataset(folder, SourceOptions(frames="8:")).train.times_s is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "found"), [("", "no rows"), ("\n \n", "no rows"), ("time,x_mm\n", "only one row, 'time,x_mm'")]
+)
+def test_a_table_without_rows_is_one_clear_error(write, text, found):
+    folder = write("", [])
+    (folder / "poses.csv").write_text(text)
+    with pytest.raises(DatasetInvalid, match=rf"poses\.csv: it must have a row of names and rows of .* it has {found}"):
         load_dataset(folder)
 
 

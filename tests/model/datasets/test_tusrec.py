@@ -101,6 +101,11 @@ def test_the_calibration_may_be_named(write: Callable[..., Path], tmp_path: Path
     [
         ({"tforms": None}, CALIBRATION, "it must have frames and tforms, it has frames"),
         ({"tforms": TFORMS[:3]}, CALIBRATION, r"tforms must be numbers \[12, 4, 4\], got float64 \[3, 4, 4\]"),
+        (
+            {"tforms": TFORMS[:0], "frames": FRAMES[:0]},
+            CALIBRATION,
+            r"it holds no frames, its frames are \[0, 48, 64\]",
+        ),
         ({"frames": FRAMES.astype(np.float32)}, CALIBRATION, "frames must be uint8"),
         ({"tforms": 2 * TFORMS}, CALIBRATION, "frame 0: its pose must end in the row"),
         ({}, "scaling\n1,0,0,0\n", "scaling must be sixteen finite numbers"),

@@ -94,6 +94,8 @@ class DicomExporter(Exporter):
         data.StudyInstanceUID, data.SeriesInstanceUID = study_uid, series_uid
         self._describe(data)
         self._describe_pixels(data)
+        if (transducer := self._header.settings.probe.dicom_type) is not None:
+            data.TransducerType = transducer
         data.SequenceOfUltrasoundRegions = [self._region()]
         figures = np.stack(list(self._figures().values()), axis=1).astype("<f4")
         block = data.private_block(PRIVATE_GROUP, PRIVATE_CREATOR, create=True)

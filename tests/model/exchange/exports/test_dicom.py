@@ -16,8 +16,9 @@ import pytest
 from PIL import Image
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundImageStorage, UltrasoundMultiFrameImageStorage
 
-from ultragray import ConvexProbe, LinearProbe
-from ultragray.errors import InvalidArgument
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.exchange.exports import export_to
 from ultragray.exchange.exports.exporter import Annotation
 from ultragray.geometry.scan_conversion import scan_convert
@@ -130,6 +131,42 @@ def test_all_that_the_standard_requires_is_there(tmp_path, probe):
         assert uid.is_valid
         assert uid.startswith("2.25.")
         assert len(uid) <= 64
+
+
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PhasedProbe(opening_angle_deg=80.0, far_mm=60.0)])
+def test_a_file_read_again_is_its_own_probe_with_its_own_poses(tmp_path, probe):
+    """Also below a band of annotations, and with other poses beside it."""
+    path = tmp_path / "frames.dcm"
+    poses = np.array(POSES)
+    poses[:, :3, :3], poses[:, :3, 3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], POSES[:, :3, 3] + 40.0
+    mark = Annotation(frame=2, picture=drawn(40, 19, np.s_[30:]))
+    data = written(path, dataclasses.replace(header(probe=probe, poses=poses), annotations=(mark,)))
+    assert data.TransducerType == {"linear": "LINEAR", "convex": "CURVED LINEAR", "phased": "SECTOR_PHASED"}[probe.kind]
+    np.save(tmp_path / "frames.poses.npy", POSES)
+    train = load_dataset(path, SourceOptions(val_frames="0")).train
+    assert train.probe == probe
+    np.testing.assert_array_equal(train.poses, poses[1:])
+    assert train.notes == (
+        "frames.poses.npy beside the file is not read: it holds its poses itself",
+        "annotations are burnt into its pixels (BurnedInAnnotation YES): crop them",
+    )
+    if probe is LINEAR:
+        np.testing.assert_array_equal(train.images[2], np.rint(FRAMES[3] * 255))
+    with pytest.raises(InvalidArgument, match=r"fan is not for frames\.dcm: it says its .* probe"):
+        load_dataset(path, SourceOptions(fan="60,20,60,1,1"))
+
+
+def test_what_is_left_of_a_damaged_export_is_one_clear_error(tmp_path):
+    path = tmp_path / "frames.dcm"
+    data = written(path, header(probe=CONVEX))
+    data.private_block(0x0019, "ULTRAGRAY")[0x01].value = POSES[:4].tobytes()
+    data.save_as(path)
+    with pytest.raises(DatasetInvalid, match=r"poses of 5 frames must have 640 bytes, .* has 512"):
+        load_dataset(path)
+    data.private_block(0x0019, "ULTRAGRAY")[0x03].value = "{}"
+    data.save_as(path)
+    with pytest.raises(DatasetInvalid, match=r"it cannot be read as DICOM"):
+        load_dataset(path)
 
 
 def position_cm(region, column, row):

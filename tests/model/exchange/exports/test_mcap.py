@@ -9,6 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import LinearProbe
 from ultragray.contract import to_dict
+from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.exchange import ros_messages
 from ultragray.exchange.poses import load_poses
 from ultragray.rendering.settings import Resolved
@@ -48,6 +49,7 @@ def test_images_come_back_with_the_stamps_of_their_poses(tmp_path, random_poses,
     expected = np.rint(255 * frames["bmode"]).astype("u1") if dtype == "uint8" else frames["bmode"]
     np.testing.assert_array_equal(got, expected)
     assert {(one.encoding, one.step, one.header.frame_id) for one in images} == {(encoding, 7 * kind.itemsize, "probe")}
+    assert load_dataset(path, SourceOptions(image_topic="/ultragray/bmode")).train.notes == ()  # 0 is a stamp
     labels = messages(path, "/ultragray/labels")
     np.testing.assert_array_equal(np.frombuffer(labels[1].data, "u1").reshape(6, 7), frames["labels"][1])
     stamps = [[(one.header.stamp.sec, one.header.stamp.nanosec) for one in images]]
