@@ -68,11 +68,7 @@ class Stamps:
         self._late = 0  # in a row
 
     def begin_anew(self, time_s: float) -> bool:
-<<<<<<< HEAD
         """Takes the next time; whether the clock was set back: it lies far before the newest, or a few in a row do."""
-=======
-        """Takes the next time; whether the clock was set back: it lies far before the newest, or several in a row do."""
->>>>>>> work-tryB
         self._late = self._late + 1 if time_s < self._newest_s else 0
         is_set_back = self._late >= _LATE or time_s < self._newest_s - _GAP_S
         if is_set_back or not self._late:

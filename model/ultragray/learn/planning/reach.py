@@ -171,9 +171,4 @@ def within_box(poses: FloatArray, probe: Probe, asked: PlanSettings) -> BoolArra
     if asked.box_mm is None:
         return np.ones(len(poses), bool)
     (low, high), faces = box_of(asked.box_mm, "box_mm"), _faces(poses, probe)
-<<<<<<< HEAD
     return np.asarray(((faces >= low) & (faces <= high)).all(axis=1), bool)
-=======
-    within: BoolArray = ((faces >= low) & (faces <= high)).all(axis=1)
-    return within
->>>>>>> work-tryB
