@@ -126,6 +126,17 @@ def test_where_a_clock_is_set_the_path_begins_anew(back_s):
     assert rms(found[None], hand_at([times[-1] + AHEAD_S]))[0] < 0.2
 
 
+def test_after_a_jump_at_one_time_the_path_begins_anew():
+    times = np.arange(0, 1, 0.04)
+    poses, path = hand_at(times), PathPredictor()
+    for time_s, pose in zip(times, poses, strict=True):
+        path.observe(time_s, pose)
+    after = poses[-1].copy()
+    after[0, 3] += 100.0
+    path.observe(times[-1], after)
+    np.testing.assert_array_equal(path.predict(times[-1] + AHEAD_S)[0], after)
+
+
 def test_poses_of_one_time_are_followed():
     path = PathPredictor()
     for pose in hand_at(np.arange(0, 1, 0.02)):

@@ -95,7 +95,7 @@ THUMBNAIL = (32, 32)
 MOST_REPEATS = 3  # of one kind that are told one by one: more in one sentence
 FLAT = 2.0  # levels, standard deviation of a thumbnail: below, it is black or noise, and its looks say little
 CUT_FACTOR, SMALLEST_CUT = 8.0, 0.15  # of one minus the correlation of two pictures
-LEAST_MARKS, MAX_BOXES = 12, 3
+LEAST_MARKS, MAX_BOXES = 12, 3  # pixels of a mark that is told, and how many marks
 MARGIN = 2  # pixels around marks whose edges are smoothed
 
 
@@ -432,7 +432,7 @@ def overlay_boxes(images: Iterable[np.ndarray], count: int) -> list[CropBox]:
     """Where images show the same bright marks while the rest of them changes, the largest first."""
     boxes = []
     for mark in burnt_in(images, count):
-        rows, columns = np.nonzero(mark)
+        rows, columns = (places + first for places, first in zip(np.nonzero(mark.pixels), mark[:2], strict=True))
         if len(rows) >= LEAST_MARKS:
             boxes.append(CropBox(int(columns.min()), int(columns.max()) + 1, int(rows.min()), int(rows.max()) + 1))
     return boxes

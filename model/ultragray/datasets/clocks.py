@@ -113,6 +113,8 @@ def poses_before(
         raise InvalidArgument(
             f"image_delay_ms is for recordings with times: {path.name} has none for every frame", field="image_delay_ms"
         )
+    if not len(times_s):
+        return poses, np.zeros(0, bool)
     times_ns = np.round((times_s - times_s.min()) * NS_PER_S).astype(np.int64)
     ascending, places = np.unique(times_ns, return_index=True)
     usual_ns = int(np.median(np.diff(ascending))) if len(ascending) > 1 else 0

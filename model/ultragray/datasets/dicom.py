@@ -88,7 +88,8 @@ def read_dicom_sweep(
         poses, poses_path = _read_poses(path, shape[0])
     else:
         poses, poses_path, notes = own.poses_of(path, shape[0]), path, own.notes(path)
-    numbers, times_s = np.flatnonzero(frames_with_pose(poses)), _times(path, header, shape[0])
+    numbers = np.flatnonzero(frames_with_pose(poses))
+    times_s = _times(path, header, shape[0], is_rendered=own is not None)
     notes += no_pose_note(numbers, shape[0], poses_path)
     poses = check_frame_poses(poses[numbers], numbers, str(poses_path))
     if delay_ns:
@@ -141,13 +142,13 @@ def read_dicom_sweep(
     return sweep, shape[0]
 
 
-def _times(path: Path, header: Any, count: int) -> FloatArray | None:  # [F] s
-    """The times of the frames; None where the file does not say them."""
+def _times(path: Path, header: Any, count: int, *, is_rendered: bool) -> FloatArray | None:  # [F] s
+    """The times of the frames; None where the file does not say them. The step of rendered ones is for viewers."""
     with _in_our_words(path):
         vector = header.get("FrameTimeVector")
         if vector is not None and len(vector) == count:
             return np.cumsum([0.0, *map(float, vector[1:])]) / 1000
-        step_ms = header.get("FrameTime")
+        step_ms = None if is_rendered else header.get("FrameTime")
         return np.arange(count) * float(step_ms) / 1000 if step_ms and float(step_ms) > 0 else None
 
 
@@ -158,12 +159,12 @@ def _header_notes(path: Path, header: Any, *, is_own: bool) -> tuple[str, ...]:
         slope, intercept = (float(header.get(f"Rescale{name}", one)) for name, one in (("Slope", 1), ("Intercept", 0)))
     is_rescaled = (slope, intercept) != (1.0, 0.0)
     is_unnamed = not is_own and _transducer(path, header) is None
-    burnt_in = "annotations are burnt into its pixels" if is_own else "the file says that its pixels name a person"
+    burnt_in = "annotations are burnt into its pixels" if is_own else "its pixels name a person: crop them"
     notes = (
         "the file does not name its transducer: taken as a linear one" if is_unnamed else "",
         f"its values are stored times {slope:g} plus {intercept:g}: taken as stored" if is_rescaled else "",
         f"its header names a person ({', '.join(named)}): convert --anonymize leaves it out" if named else "",
-        f"{burnt_in} (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
+        f"{burnt_in} (BurnedInAnnotation YES)" if is_burnt_in else "",
     )
     return tuple(note for note in notes if note)
 
@@ -465,7 +466,8 @@ def _read_frames(
     interpretation, bits = str(header.PhotometricInterpretation), int(header.get("BitsStored", 8))
     is_wide = bits > 8 and interpretation in GREY[:2]
     frames = np.empty((len(chosen), *shape[1:]), np.uint16 if is_wide else np.uint8)
-    syntax = header.file_meta.TransferSyntaxUID
+    with _in_our_words(path):
+        syntax = header.file_meta.TransferSyntaxUID
     if syntax in JPEG and bits == 8 and interpretation != "PALETTE COLOR":
         return _read_jpeg(path, header, shape, chosen)
     said: tuple[str, ...] = ()

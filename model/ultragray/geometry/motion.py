@@ -102,10 +102,10 @@ class PathPredictor:
         if after_s < 0.0:
             return
         step = np.stack([pose[:3, 3] - self._pose[:3, 3], turns_of(self._pose[:3, :3].T @ pose[None, :3, :3])[0]])
-        if after_s == 0.0:
+        if after_s == 0.0 and not (np.linalg.norm(step, axis=1) > _JUMP).any():
             self._pose, self._places[-1] = pose, self._places[-1] + step
             return
-        if after_s > _GAP_S or self._is_jump(step, after_s):
+        if after_s == 0.0 or after_s > _GAP_S or self._is_jump(step, after_s):
             self._begin(time_s, pose)
             return
         self._pose = pose

@@ -91,6 +91,7 @@ class StreamPreview:
         """Takes a pose [4, 4] mm, in the scene. A late one, not newer than the newest, is left out."""
         if self._stamps.begin_anew(measured_s):
             self._path.clear()
+            self._newest = self._waiting = None  # of the clock as it was
         if not self._path or measured_s > self._path[-1][0]:
             self._path.append((measured_s, pose))
 

@@ -7,7 +7,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep, checks
 from ultragray.datasets.checks import check_dataset
-from ultragray.datasets.clocks import PoseTrack, clock_warnings, parse_delay_ns
+from ultragray.datasets.clocks import PoseTrack, clock_warnings, parse_delay_ns, poses_before
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -206,3 +206,8 @@ def test_poses_with_stamps_that_come_twice_or_step_back(tmp_path):
     notes = load_dataset(bag.finish()).train.notes
     assert "1 poses of /pose have the stamp of another one: the last of them is taken" in notes
     assert "the stamps of /pose step back 1 times: its poses were put in their order" in notes
+
+
+def test_of_no_frames_no_pose_is_known_before_them(tmp_path):
+    poses, is_known = poses_before(np.zeros((0, 4, 4)), np.zeros(0), 20_000_000, tmp_path)
+    assert (len(poses), len(is_known)) == (0, 0)

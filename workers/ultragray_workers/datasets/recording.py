@@ -198,6 +198,7 @@ class RecordingWriter:
             del sizes[last]
         self._count = len(sizes)
         self._first_numbers: dict[int, int] = {}  # of blocks that were looked into
+        self._looked_into: tuple[int, list[RecordedFrame]] | None = None  # the last of them, whole
         self.state = RecordingState(name, header.settings, frames, next_number, sum(sizes.values()), header.created_at)
 
     def has(self, frame: RecordedFrame) -> bool:
@@ -205,13 +206,17 @@ class RecordingWriter:
 
         Numbers rise from block to block, and within one.
         """
-        after = bisect_right(range(self._count), frame.number, key=self._first_number)
-        found = _unpack(self._storage.read(_block_key(self._header, after - 1)), self._header.settings) if after else ()
+        block = bisect_right(range(self._count), frame.number, key=self._first_number) - 1
+        if block < 0:
+            return False
+        if self._looked_into is None or self._looked_into[0] != block:
+            found = _unpack(self._storage.read(_block_key(self._header, block)), self._header.settings)
+            self._looked_into = block, found or []
         return any(
             one.number == frame.number
             and np.array_equal(one.pose, frame.pose)
             and np.array_equal(one.pixels, frame.pixels)
-            for one in found or ()
+            for one in self._looked_into[1]
         )
 
     def append(self, frames: Sequence[RecordedFrame], max_bytes: int | None = None) -> RecordingState:

@@ -247,9 +247,10 @@ def choose(
             if not is_shaded[view]:
                 shade(view)
                 is_shaded[view] = True
-            bounds[view] = np.maximum(worth[view] - best, 0.0).mean(dtype=np.float64)
+            gain = np.maximum(worth[view] - best, 0.0).mean(dtype=np.float64)
+            bounds[view] = gain if gain >= LEAST_GAIN else 0.0  # for good: the more views, the less one adds
             is_known[view] = True
-        if bounds[view] < LEAST_GAIN or math.isinf(costs[view]):
+        if not bounds[view] or math.isinf(costs[view]):
             break
         chosen.append(view)
         gains.append(float(bounds[view]))
@@ -435,7 +436,12 @@ def plan_views(
         is_shaded[view] = True
 
     if way is not None:
-        chosen, gains = choose(worths, best.copy(), asked.views, shade=shade_once, costs=way.costs, after_each=way.add)
+
+        def go_on(view: int) -> None:
+            limits.check_flag()
+            way.add(view)
+
+        chosen, gains = choose(worths, best.copy(), asked.views, shade=shade_once, costs=way.costs, after_each=go_on)
         order, path_mm = np.array([chosen.index(view) for view in way.views], np.int64), way.length_mm
     else:
         chosen, _ = choose(worths, best.copy(), asked.views, shade=shade_once)

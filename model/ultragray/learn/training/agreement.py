@@ -420,7 +420,10 @@ def _marks_of(sweep: Sweep) -> Sweep | None:
     marks = burnt_in(sweep.images, len(sweep))
     if not marks:
         return None
-    grown = cv2.dilate(255 * np.any(marks, axis=0).astype(np.uint8), np.ones((MARK_MARGIN, MARK_MARGIN), np.uint8))
+    bright = np.zeros(sweep.images.shape[1:], np.uint8)
+    for mark in marks:
+        bright[mark.box][mark.pixels] = 255
+    grown = cv2.dilate(bright, np.ones((MARK_MARGIN, MARK_MARGIN), np.uint8))
     return replace(sweep.select([0]), images=grown[None].astype(np.uint8))
 
 

@@ -148,8 +148,9 @@ def test_a_file_read_again_is_its_own_probe_with_its_own_poses(tmp_path, probe):
     np.testing.assert_array_equal(train.poses, poses[1:])
     assert train.notes == (
         "frames.poses.npy beside the file is not read: it holds its poses itself",
-        "annotations are burnt into its pixels (BurnedInAnnotation YES): crop them",
+        "annotations are burnt into its pixels (BurnedInAnnotation YES)",
     )
+    assert train.times_s is None  # rendered frames have none
     if probe is LINEAR:
         np.testing.assert_array_equal(train.images[2], np.rint(FRAMES[3] * 255))
     with pytest.raises(InvalidArgument, match=r"fan is not for frames\.dcm: it says its .* probe"):

@@ -13,7 +13,7 @@ from ultragray import LinearProbe, PlanSettings, plan_views
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.rotations import rotation_angles_deg
 from ultragray.learn.planning.reach import LEAST_CONTACT, poses_in_reach
-from ultragray.learn.planning.search import choose, distances_mm, exchange, shortest_path
+from ultragray.learn.planning.search import Way, choose, distances_mm, exchange, shortest_path
 from ultragray.learn.sweep import corner_distances_mm
 from ultragray.phantom.demo import load_demo_scene
 from ultragray.rendering.contact import Skin, Touch
@@ -207,6 +207,17 @@ def test_views_too_far_for_the_way_do_not_keep_others_from_it(path_mm: float) ->
         assert plan.path_mm == pytest.approx(corner_distances_mm(corners[1:], corners[:-1]).sum())
         assert plan.after - plan.before == pytest.approx(plan.gains.sum())
         assert sorted(plan.ranks) == list(range(len(plan.poses)))
+
+
+def test_a_near_view_that_hardly_gains_does_not_keep_a_far_one_from_the_way() -> None:
+    places = np.zeros((3, 4, 3))
+    places[:, :, 0] = np.array([0.0, 0.01, 900.0])[:, None]
+    worth = np.zeros((3, 1000), np.float32)
+    worth[:2, :500], worth[1, 0], worth[0, 600], worth[2, 500] = 0.5, 0.6, 8.9e-4, 0.5
+    way = Way(places, None, 2000.0)
+    chosen, _ = choose(worth, np.zeros(1000, np.float32), 5, costs=way.costs, after_each=way.add)
+    assert sorted(chosen) == sorted(way.views) == [1, 2]
+    assert way.length_mm == pytest.approx(899.99)
 
 
 def test_bone_is_looked_at_from_where_it_is_seen() -> None:
