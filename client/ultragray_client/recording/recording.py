@@ -5,10 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+import threading
+import weakref
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
+from typing import TypeAlias
 
 from ..errors import ExtraMissing, InvalidArgument
 from ..frames import Frame, origin_of
@@ -41,8 +45,11 @@ class Recording:
         self._is_writable = True
         with self._giving_up_on_error():
             self._writer = RosRecording(self._file)
-        # Ctrl-C interrupts the caller, not this thread: no message is half written.
-        self._thread = ThreadPoolExecutor(1, "recording")
+        # Ctrl-C interrupts the caller, not this thread: no message is half written. Only queues lie between them, as an
+        # interrupt may leave the locks of an executor held.
+        self._work: SimpleQueue[_Work | None] = SimpleQueue()
+        threading.Thread(target=_do_all, args=(self._work,), name="recording", daemon=True).start()
+        self._end = weakref.finalize(self, self._work.put, None)
 
     def __enter__(self) -> Recording:
         return self
@@ -66,13 +73,22 @@ class Recording:
                 field="time_ns",
             )
         self._next_ns = stamp_ns + FRAME_TIME_NS
-        self._thread.submit(self._write, frame, stamp_ns).result()
+        self._do(partial(self._write, frame, stamp_ns))
 
     def close(self) -> None:
         """Make the file whole and give it its name; a second time nothing. Raises OSError."""
-        with self._thread as thread:
+        try:
             if self._is_writable:
-                thread.submit(self._finish).result()
+                self._do(self._finish)
+        finally:
+            self._end()
+
+    def _do(self, task: Callable[[], None]) -> None:
+        """Has the thread do a task, and waits for it. Raises what it raises."""
+        done: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._work.put((task, done))
+        if (error := done.get()) is not None:
+            raise error
 
     def _write(self, frame: Frame, stamp_ns: int) -> None:
         with self._giving_up_on_error():
@@ -101,3 +117,18 @@ class Recording:
                 self._file.close()
             self._temporary.unlink(missing_ok=True)
             raise
+
+
+_Work: TypeAlias = tuple[Callable[[], None], "SimpleQueue[BaseException | None]"]  # and where its outcome goes
+
+
+def _do_all(work: SimpleQueue[_Work | None]) -> None:
+    while (asked := work.get()) is not None:
+        task, done = asked
+        try:
+            task()
+        except BaseException as error:
+            done.put(error)
+        else:
+            done.put(None)
+        del asked, task, done  # else the recording would not end while the next one is waited for
