@@ -480,10 +480,10 @@ def _step(fit: _Fit, damping: FloatArray) -> FloatArray:  # [K] -> [K, 6] mm
     slope = (fit.changes @ fit.left[..., None]) / pixels
     curvature = fit.changes @ fit.changes.swapaxes(1, 2) / pixels  # Gauss and Newton's
     own = curvature.diagonal(axis1=1, axis2=2)
-    floor = 1e-2 * own.mean(axis=1, keepdims=True) + np.finfo(np.float64).tiny
+    # Where nothing changes, as in a black frame, epsilon gives the matrix an inverse.
+    floor = 1e-2 * own.mean(axis=1, keepdims=True) + np.finfo(np.float64).eps
     damped = curvature + (damping[:, None] * (own + floor) + 1e-9 * floor)[..., None] * np.eye(own.shape[1])
-    # Where nothing changes, as in a black frame, the matrix has no inverse.
-    downhill = -torch.linalg.lstsq(torch.from_numpy(damped), torch.from_numpy(slope)).solution[..., 0].numpy()
+    downhill = -np.linalg.solve(damped, slope)[..., 0]  # not by torch, whose sums differ from call to call
     lengths = np.linalg.norm(downhill, axis=1, keepdims=True)
     steps: FloatArray = downhill * (LONGEST_STEP_MM / np.maximum(lengths, LONGEST_STEP_MM))
     return steps

@@ -1,7 +1,7 @@
 """localize(): frames of a scene are found again from a start that is off, and what cannot be found is told."""
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -59,6 +59,14 @@ def test_frames_of_a_scene_are_found_from_3_mm_and_5_degrees_away(demo):
         assert found.is_found
         assert is_found(found.pose, pose, probe), seed
         assert (found.shift_mm, found.turn_deg) == pytest.approx(distance(start, found.pose, probe))
+
+
+def test_a_search_that_is_repeated_tells_the_same_to_the_last_bit(demo):
+    probe, pose = demo.info.probe_or(None), demo_poses(3)[1]
+    image, start = frame_of(demo, pose), displaced(pose, probe, 2.0, 3.0, 0)
+    first, *others = (astuple(localize(demo, image, start)) for _ in range(4))
+    for other in others:
+        np.testing.assert_equal(other, first)
 
 
 @pytest.mark.long
