@@ -245,8 +245,8 @@ class Recordings(Group[AnyConnection]):
 
     @operation
     def finish(self, name: str, *, timeout_s: float | None = None) -> LongCall[Dataset]:
-        """Makes a recording a dataset, checked as an upload is. Without `timeout_s` it takes as long as it takes.
-        Raises DatasetInvalid.
+        """Makes a recording a dataset, checked as an upload is; returns it again where it is one already. Without
+        `timeout_s` it takes as long as it takes. Raises DatasetNotFound, DatasetInvalid.
         """
         return LongCall("RecordingService.FinishRecording", Dataset, timeout_s, dataset=name)
 

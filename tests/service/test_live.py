@@ -80,6 +80,8 @@ def test_frames_are_posted_one_by_one_and_become_a_dataset(http, begun):
     assert any("lost on the way" in warning for warning in record["warnings"])
     assert http.get(f"/v1/recordings/{begun}").status_code == 404
     assert http.get(f"/v1/datasets/{begun}").json() == record
+    assert http.post(f"/v1/recordings/{begun}:finish").json() == record  # its answer may have been lost on the way
+    assert http.post(f"/v1/recordings/{begun}-2:finish").json()["reason"] == "DATASET_NOT_FOUND"
 
 
 @pytest.mark.parametrize(
@@ -225,6 +227,10 @@ def test_others_do_not_add_to_a_recording(start_service, tmp_path):
         with pytest.raises(errors.DatasetNotFound):
             other.recordings.get("secret")
         assert list(mine.recordings.record("secret", [frame_of(0)]))[-1].recording.private
+        list(mine.recordings.record("liver", map(frame_of, range(6))))
+        assert mine.recordings.finish("liver") == mine.recordings.finish("liver")
+        with pytest.raises(errors.PermissionDenied):
+            other.recordings.finish("liver")
 
 
 def test_a_scene_grows_while_it_is_scanned_and_outlives_killed_workers(client, http, begun, artifacts, tmp_path):

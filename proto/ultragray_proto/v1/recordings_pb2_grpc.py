@@ -89,7 +89,8 @@ class RecordingServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def FinishRecording(self, request, context):
-        """Makes a recording a dataset, checked as an upload is, and returns that. DATASET_INVALID.
+        """Makes a recording a dataset, checked as an upload is, and returns that; the dataset again, where it is one already.
+        DATASET_NOT_FOUND, DATASET_INVALID.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -232,7 +232,14 @@ class OpenRecordings:
                 await asyncio.shield(stream.stored())
 
     async def finish(self, name: str) -> DatasetRecord:
-        """Makes a recording a data set, after the check of an upload. Raises DatasetNotFound, DatasetInvalid."""
+        """Makes a recording a data set, after the check of an upload; of one that is one already, the data set, for a
+        client who did not hear the answer. Raises DatasetNotFound, DatasetInvalid.
+        """
+        if not await asyncio.to_thread(self._recordings.is_open, name):
+            account().target = name
+            record = await asyncio.to_thread(self._store.get, name)
+            self._means.owners.require_change(Kind.DATASET, name)
+            return record
         async with self._alone(name):
             if await asyncio.to_thread(self._store.manifest, name) is None:  # else a service died right after it
                 await self._take_in(name)

@@ -74,7 +74,10 @@ async def add_frame(request: Request, service: ServiceDep, dataset: DatasetName)
 
 @router.post("/{dataset}:finish", responses=problems(401, 403, 404, 409, 413, 422, 429, 500, 503, 504, 507))
 async def finish_recording(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
-    """Makes a recording a dataset, checked as an upload is. Every fifth frame, from the third, is held out."""
+    """Makes a recording a dataset, checked as an upload is. Every fifth frame, from the third, is held out.
+
+    Where it is one already, the dataset again.
+    """
     service.life.require_serving()
     return service.datasets.with_owner(await service.recordings.finish(dataset))
 
