@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,7 @@ from hand import ERRORS, SWEEPS
 from measuring import Document, Lines, columns, measure_runs
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import turns_of
 from ultragray.learn.localization.appearance import Motions
 from ultragray.learn.localization.search import Tracker, localize
 from ultragray.learn.localization.settings import Localization, SearchKind
@@ -131,9 +132,12 @@ def row(held_out: HeldOut) -> Document:
         "on_path": (scene.poses_at_rest(poses), held_out.on_path),
         "true": (poses, held_out.true),
     }
+    own, right = next(errors[kind] for kind in ("true", "on_path", "recorded") if errors[kind][1] is not None)
+    ratios = deviations_of(motions, found, own, right)
     return {
         "frames": len(found),
         **{name: None if right is None else scores(motions, own, right) for name, (own, right) in errors.items()},
+        **{f"within_{count}": float(np.mean(ratios < count)) for count in (1, 2)},
         "same_place": float(np.mean([one < SAME_MM for one in apart_mm])),
         "is_found": float(np.mean([one.is_found for one in found])),
         "p50_cpu_s": float(np.median(took_s)),
@@ -149,6 +153,16 @@ def scores(motions: Motions, found: FloatArray, right: FloatArray) -> Document: 
         "median_mm": float(np.median(shifts_mm)),
         "median_deg": float(np.median(turns_deg)),
     }
+
+
+def deviations_of(
+    motions: Motions, found: Sequence[Localization], poses: FloatArray, right: FloatArray
+) -> FloatArray:  # [F, 4, 4] mm, both -> [F, 6]
+    """The sizes of the errors of all six numbers, in standard deviations as they are told."""
+    left, middle = np.linalg.inv(poses) @ right, motions.middle_mm.numpy()
+    errors_mm = left[:, :3, 3] + left[:, :3, :3] @ middle - middle
+    errors = np.concatenate([errors_mm, np.degrees(turns_of(left[:, :3, :3]))], axis=1)
+    return np.abs(errors) / [one.position_std_mm + one.angle_std_deg for one in found]
 
 
 def displaced(pose: FloatArray, motions: Motions, random: np.random.Generator) -> FloatArray:  # [4, 4] both
@@ -179,6 +193,7 @@ def found_frames(figures: Document) -> Lines:
             "against the recorded poses": "{recorded}",
             "the path": "{on_path}",
             "the true poses": "{true}",
+            "errors within 1σ, 2σ": "{within_1:.0%}, {within_2:.0%}",
             "both searches end in one place": "{same_place:.0%}",
             "CPU time, median and 90 of 100": "{p50_cpu_s:.2f} s, {p90_cpu_s:.2f} s",
         },

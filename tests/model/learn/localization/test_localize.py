@@ -10,6 +10,7 @@ import torch
 from ultragray import ConvexProbe, LinearProbe, localize, render
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.rotations import turns_of
 from ultragray.learn.localization import search
 from ultragray.learn.localization.appearance import Motions, displacements
 from ultragray.learn.localization.search import Tracker, _deviations
@@ -157,12 +158,35 @@ def test_another_image_is_not_found(demo):
     assert not localize(demo, noise, demo_poses(3)[1]).is_found
 
 
+@pytest.mark.long
+def test_errors_are_as_large_as_they_are_told_to_be(demo):
+    """Of frames with speckle that the scene has never seen: two of three within one deviation, nearly all within two.
+
+    The errors of one frame go together, so that 40 frames are few: hence at most 97% within one.
+    """
+    motions, ratios = Motions.of(PHANTOM_PROBE), []
+    for tilt_deg, offset_mm in ((5.0, 1.0), (-7.0, -1.5)):
+        poses = freehand_poses(20, tilt_deg=tilt_deg, offset_mm=offset_mm, unrest=2.0)
+        for pose, image in zip(poses, simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE), strict=True):
+            found = localize(demo, image, pose)
+            left = np.linalg.inv(found.pose) @ pose
+            middle = motions.middle_mm.numpy()
+            errors_mm = left[:3, 3] + left[:3, :3] @ middle - middle
+            errors_deg = np.degrees(turns_of(left[None, :3, :3])[0])
+            ratios += [*(errors_mm / found.position_std_mm), *(errors_deg / found.angle_std_deg)]
+    assert 0.68 < np.mean(np.abs(ratios) < 1.0) < 0.97
+    assert np.mean(np.abs(ratios) < 2.0) > 0.9
+
+
 def test_deviations_are_those_of_a_known_regression():
-    """Independent noise of standard deviation s: the deviation of each number is s / sqrt(sum of its squares)."""
+    """Independent noise of standard deviation s: the deviation of each number is s / sqrt(sum of its squares), and
+    what the scene errs comes on top.
+    """
     random = np.random.default_rng(0)
     changes, left = random.normal(size=(6, 160, 120)), 0.3 * random.normal(size=(160, 120))
     expected = 0.3 / np.sqrt(np.square(changes).sum(axis=(1, 2)))
-    assert (_deviations(left, changes) / expected).tolist() == pytest.approx([1.0] * 6, abs=0.35)
+    told = _deviations(left, changes) / search.SCENE_ERROR
+    assert (told / expected).tolist() == pytest.approx([1.0] * 6, abs=0.5)
 
 
 BLACK, HERE = np.zeros((64, 64), np.uint8), np.eye(4)
