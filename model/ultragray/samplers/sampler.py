@@ -40,8 +40,8 @@ class Sampler(Family):
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         raise NotImplementedError
 
-    def _require_few(self, made: float, name: str) -> None:
-        if made > MAX_POSES:
+    def _require_few(self, count: float, name: str) -> None:
+        if count > MAX_POSES:
             raise InvalidArgument(
                 f"{name} {getattr(self, name):g} gives more than the {MAX_POSES:,} poses that can be made", field=name
             )
@@ -166,15 +166,15 @@ class CoveredSampler(DrawnSampler):
         links = links[np.minimum(places, np.flatnonzero(lengths)[-1])]
         first, second = base[links[:, 0]], base[links[:, 1]]
         shares = random.uniform(size=self.count)
-        made = np.tile(np.eye(4), (self.count, 1, 1))
+        poses = np.tile(np.eye(4), (self.count, 1, 1))
         steps = second[:, :3, 3] - first[:, :3, 3]
-        made[:, :3, 3] = first[:, :3, 3] + shares[:, None] * steps
-        made[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
+        poses[:, :3, 3] = first[:, :3, 3] + shares[:, None] * steps
+        poses[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
         radii = np.linalg.norm(steps, axis=1) * np.cbrt(random.uniform(size=self.count))
-        made[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
+        poses[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
         turns = turn_angles_rad(first[:, :3, :3], second[:, :3, :3]) * random.uniform(size=self.count)
-        made[:, :3, :3] = made[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
-        return made
+        poses[:, :3, :3] = poses[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
+        return poses
 
 
 @lru_cache(1)  # the same for all blocks
@@ -256,10 +256,10 @@ class SplineSampler(Sampler):
         places = self._places(float(at[-1]))
         segments = np.clip(np.searchsorted(at, places, side="right") - 1, 0, len(lengths) - 1)
         shares = (places - at[segments]) / lengths[segments]
-        made = np.tile(np.eye(4), (len(places), 1, 1))
-        made[:, :3, 3] = _natural_cubic(knots[:, :3, 3], lengths, segments, shares)
-        made[:, :3, :3] = blended(knots[segments, :3, :3], knots[segments + 1, :3, :3], shares)
-        return made
+        poses = np.tile(np.eye(4), (len(places), 1, 1))
+        poses[:, :3, 3] = _natural_cubic(knots[:, :3, 3], lengths, segments, shares)
+        poses[:, :3, :3] = blended(knots[segments, :3, :3], knots[segments + 1, :3, :3], shares)
+        return poses
 
     def _places(self, length_mm: float) -> FloatArray:  # [C]
         if self.count is not None:
