@@ -35,9 +35,9 @@ class Sampler(Family):
         checked = check_poses(base)
         if not len(checked):
             raise InvalidArgument(f"sampler {self.kind} needs base poses, got none", field="kind")
-        return check_poses(self._made(checked, probe))
+        return check_poses(self._new_poses(checked, probe))
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         raise NotImplementedError
 
     def _require_few(self, count: float, name: str) -> None:
@@ -79,7 +79,7 @@ class DrawnSampler(Sampler):
                 field="count",
             )
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         self.require_few()
         return np.concatenate([self.block(number)._drawn(base, probe) for number in range(self.block_count)])
 
@@ -212,7 +212,7 @@ class FanSampler(Sampler):
     step_deg: float = described("Between two tilts.", above=0.0, high=MAX_TILT_DEG)
     kind: Literal["fan"] = kind_field("fan")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         steps = math.floor(min(self.tilt_deg / self.step_deg, 1e9) + 1e-9)
         tilts = 2 * steps + 1
         self._require_few(float(tilts) * len(base), "step_deg")
@@ -247,7 +247,7 @@ class SplineSampler(Sampler):
         if (self.count is None) == (self.spacing_mm is None):
             raise InvalidArgument("exactly one of count and spacing_mm must be given", field="count")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         knots = _without_repetitions(base)
         if len(knots) < 2:
             raise InvalidArgument("sampler spline needs at least two different base poses, got one", field="kind")
@@ -320,5 +320,5 @@ class TrainingSampler(Sampler):
 
     kind: Literal["training"] = kind_field("training")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         return base
