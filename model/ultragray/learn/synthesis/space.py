@@ -60,10 +60,10 @@ class BodySpace:
                     layers.append(_Drawn(body, number, *body.shape.bounds_mm()))
 
         def number_at(points: FloatArray) -> ByteArray:
-            numbers = np.zeros(len(points), np.uint8)
+            at_points = np.zeros(len(points), np.uint8)
             for layer in layers:
-                layer.draw(points, numbers)
-            return numbers
+                layer.draw(points, at_points)
+            return at_points
 
         boxes = np.array([layer.bounds_mm() for layer in layers])
         resolution = min(layer.resolution_mm for layer in layers)
