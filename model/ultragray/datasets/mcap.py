@@ -106,7 +106,7 @@ class TrackedPoses:
         self._frames: dict[str, Counter[str]] = {}  # that the poses of a topic are in
         self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
         self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
-        self._told_by: dict[TransformName, set[str]] = {}  # the topics of tf that tell a moving one
+        self._topics_of: dict[TransformName, set[str]] = {}  # the topics of tf that tell a moving one
         self._fixed: dict[TransformName, list[_Stamped]] = {}
 
     @property
@@ -131,7 +131,7 @@ class TrackedPoses:
             for transform in message.decode().transforms:
                 kept.setdefault(_name_of(transform), []).append(_stamped(transform, message))
                 if not is_static:
-                    self._told_by.setdefault(_name_of(transform), set()).add(message.topic)
+                    self._topics_of.setdefault(_name_of(transform), set()).add(message.topic)
 
     def way(self, topic: str, frame: str, transform: str | None) -> Way:
         """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
@@ -188,7 +188,7 @@ class TrackedPoses:
         notes: list[str] = []
         for name, is_inverted in way:
             called, is_tracked = "To".join(name), name in self._transforms
-            if len(topics := self._told_by.get(name, set())) > 1:
+            if len(topics := self._topics_of.get(name, set())) > 1:
                 raise DatasetInvalid(
                     f"{self._path}: {called} is told on {' and on '.join(sorted(topics))}: record the tf of one robot, "
                     "or give their frames names of their own"
