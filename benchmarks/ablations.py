@@ -97,8 +97,8 @@ def measure_hand(name: str, variation: str, seed: int, _: Path) -> Document:
             patches.enter_context(patch.object(agreement, part, instead))
         trained = train_and_evaluate(dataset, config)
         scores = score_held_out(trained.scene, dataset, trained.evaluation).to_dict()
-    found = {kind: one["mean"] for kind, one in scores.items() if one is not None}
-    return {**found, "config": config.to_dict()}
+    means = {kind: one["mean"] for kind, one in scores.items() if one is not None}
+    return {**means, "config": config.to_dict()}
 
 
 RUNS = {
@@ -130,8 +130,8 @@ def path_without(figures: Document) -> Lines:
     names = [name for name in HANDS if any(run.startswith(name) for run in figures)]
 
     def cell(name: str, variation: str, kind: str) -> str:
-        found = [figures.get(f"{name}, {variation}, seed {seed}", {}).get(kind) for seed in SEEDS]
-        runs = [one for one in found if one is not None]
+        candidates = [figures.get(f"{name}, {variation}, seed {seed}", {}).get(kind) for seed in SEEDS]
+        runs = [one for one in candidates if one is not None]
         if not runs:
             return "–"
         pairs = ((key, [run[key] for run in runs], digits) for key, digits in (("psnr_db", 2), ("gmsd", 3)))
@@ -157,12 +157,12 @@ def trained_without(figures: Document) -> Lines:
 
     def cell(of: str, variation: str, keys: Sequence[str]) -> str:
         runs = [figures.get(f"{of}, {variation}, seed {seed}", {}) for seed in SEEDS]
-        shown = []
+        texts = []
         for key in keys:
             if values := [run[key] for run in runs if key in run]:
                 digits = {"psnr_db": 2, "shadow_mae": 4}.get(key, 3)
-                shown.append(f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}")
-        return " / ".join(shown) or "–"
+                texts.append(f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}")
+        return " / ".join(texts) or "–"
 
     def variations(names: Iterable[str], keys: Sequence[str]) -> Iterator[str]:
         return table(("", *sets), ((name, *(cell(of, name, keys) for of in sets)) for name in names))

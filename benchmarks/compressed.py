@@ -138,7 +138,7 @@ def kept(measured: Document) -> Lines:
         }
         for name, run in measured.items()
     ]
-    shown = {
+    cells = {
         "Scene": "{name}",
         "Gaussians": "{gaussians:,}",
         "Bytes of each, of degree 0": "{bytes_per_gaussian_of_degree_0:.1f}",
@@ -149,7 +149,7 @@ def kept(measured: Document) -> Lines:
         "in the worst frame": "{worst_frame:.4f}",
         "dB to the whole, after a share of the bytes": "{first}",
     }
-    return columns(rows, shown)
+    return columns(rows, cells)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from in_silico import IN_SILICO, Asked
+from in_silico import IN_SILICO, Case
 from measuring import ROOT, Document, Lines, columns, measure_runs, table
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.evaluation.metrics import frame_metrics
@@ -40,19 +40,19 @@ COLOURS = {
 }
 
 
-def recorded(folder: Path, name: str) -> Asked:
+def recorded(folder: Path, name: str) -> Case:
     """A recorded set: its held-out frames, and where it has more than 40 training frames a band and an end of these."""
     dataset = load_dataset(folder / name)
     train, count = dataset.train, len(dataset.train)
     if count <= 40:
-        return Asked(train, dataset.val, np.array(["random"] * len(dataset.val)))
+        return Case(train, dataset.val, np.array(["random"] * len(dataset.val)))
     numbers = np.arange(count)
     gap = (numbers >= 0.4 * count) & (numbers < 0.5 * count)
     end = numbers >= 0.9 * count
     random = (numbers % 7 == 3) & ~gap & ~end
     left_out = gap | end | random
     causes = np.where(gap, "gap", np.where(end, "end", "random"))[left_out]
-    return Asked(train.select(numbers[~left_out]), train.select(numbers[left_out]), causes)
+    return Case(train.select(numbers[~left_out]), train.select(numbers[left_out]), causes)
 
 
 RECORDED = ("spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom")
@@ -60,20 +60,20 @@ RECORDED = ("spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom")
 
 def measure(name: str, data_folder: Path) -> Document:
     """Trains a scene, renders what it has not seen and measures each frame and its pixels."""
-    asked = IN_SILICO[name]() if name in IN_SILICO else recorded(data_folder, name)
+    case = IN_SILICO[name]() if name in IN_SILICO else recorded(data_folder, name)
     started = time.monotonic()
-    unseen, causes = asked.unseen, asked.causes
-    scene = train(Dataset("asked", asked.training, unseen.select([])), TrainingConfig.preset("fast"))
+    unseen, causes = case.unseen, case.causes
+    scene = train(Dataset("asked", case.training, unseen.select([])), TrainingConfig.preset("fast"))
     seconds = time.monotonic() - started
     frames = {name: render_sweep(scene, unseen, output=name) for name in ("bmode", "coverage", "uncertainty")}
     truth = (unseen.images / 255.0).astype(np.float32)
     metrics = frame_metrics(torch.from_numpy(frames["bmode"]), torch.from_numpy(truth))
     assessor = Assessor(scene.info, scene.training_poses)
-    told = assessor.assess(unseen.poses, coverage=frames["coverage"])
+    of_frames = assessor.assess(unseen.poses, coverage=frames["coverage"])
     of_poses = assessor.assess(unseen.poses)
     errors = truth - frames["bmode"]
     figures: dict[str, Any] = {
-        "training_frames": len(asked.training),
+        "training_frames": len(case.training),
         "seconds": round(seconds, 1),
         "causes": {},
     }
@@ -81,35 +81,37 @@ def measure(name: str, data_folder: Path) -> Document:
         chosen = causes == cause
         figures["causes"][cause] = {
             "actual": [round(frame.ms_ssim, 4) for frame, one in zip(metrics, chosen, strict=True) if one],
-            "told": _rounded([one.confidence for one, is_one in zip(told, chosen, strict=True) if is_one]),
+            "told": _rounded([one.confidence for one, is_one in zip(of_frames, chosen, strict=True) if is_one]),
             "of_pose": _rounded([one.confidence for one, is_one in zip(of_poses, chosen, strict=True) if is_one]),
-            "supported_share": _rounded([o.supported_share for o, is_one in zip(told, chosen, strict=True) if is_one]),
+            "supported_share": _rounded(
+                [o.supported_share for o, is_one in zip(of_frames, chosen, strict=True) if is_one]
+            ),
             "uncertainty": asdict(compare_deviations(errors[chosen], frames["uncertainty"][chosen])),
         }
     return figures
 
 
-def error(found: Document, key: str) -> float:
+def error(figures: Document, key: str) -> float:
     """The mean error of what was told, or told of the pose alone."""
-    return float(np.abs(np.array(found[key]) - np.array(found["actual"])).mean())
+    return float(np.abs(np.array(figures[key]) - np.array(figures["actual"])).mean())
 
 
-def is_telling(found: Document) -> bool:
+def is_telling(figures: Document) -> bool:
     """Whether actual values vary enough for ranks to mean something."""
-    return bool(np.std(found["actual"]) > TELLING_STD)
+    return bool(np.std(figures["actual"]) > TELLING_STD)
 
 
-def rank_correlation(found: Document, key: str) -> float:
+def rank_correlation(figures: Document, key: str) -> float:
     """Spearman's, of what was told and what came out; no two values are equal."""
-    ranks = [np.array(values).argsort().argsort() for values in (found[key], found["actual"])]
+    ranks = [np.array(values).argsort().argsort() for values in (figures[key], figures["actual"])]
     return float(np.corrcoef(*ranks)[0, 1])
 
 
 def cells(figures: Document) -> Iterator[tuple[str, str, Document]]:
     """Scene, cause and figures, in the order of the tables."""
     for name in (*IN_SILICO, *RECORDED):
-        for cause, found in figures.get(name, {"causes": {}})["causes"].items():
-            yield name, cause, found
+        for cause, of_cause in figures.get(name, {"causes": {}})["causes"].items():
+            yield name, cause, of_cause
 
 
 def draw(figures: Document) -> None:
@@ -122,11 +124,11 @@ def draw(figures: Document) -> None:
         for axis, name in zip(axes, names, strict=False):
             most = 1.0 if key == "told" else 0.45
             axis.plot([0, most], [0, most], color="#9aa5b1", linewidth=1.0)
-            for cause, found in figures[name]["causes"].items():
+            for cause, of_cause in figures[name]["causes"].items():
                 if key == "told":
-                    axis.plot(found["told"], found["actual"], ".", color=COLOURS[cause], label=cause, alpha=0.7)
+                    axis.plot(of_cause["told"], of_cause["actual"], ".", color=COLOURS[cause], label=cause, alpha=0.7)
                 else:
-                    bins = found["uncertainty"]["bins"]
+                    bins = of_cause["uncertainty"]["bins"]
                     expected, actual = ([one[side] for one in bins] for side in ("expected", "actual"))
                     axis.plot(expected, actual, ".-", color=COLOURS[cause], label=cause)
             axis.set(xlim=(0, most), ylim=(0, most), title=name, aspect="equal")
@@ -146,31 +148,31 @@ def _rounded(values: list[float | None]) -> list[float]:
 
 def confidence_and_uncertainty(figures: Document) -> Lines:
     """What scenes tell of frames that they have not seen, beside what came out, cause by cause."""
-    found_cells = list(cells(figures))
+    all_cells = list(cells(figures))
     rows = []
-    for name, cause, found in found_cells:
-        actual = np.array(found["actual"])
+    for name, cause, of_cause in all_cells:
+        actual = np.array(of_cause["actual"])
         agreements = []
         for key in ("told", "of_pose"):
-            rank = f"{rank_correlation(found, key):.2f}" if is_telling(found) else "–"
-            agreements.append(f"{error(found, key):.3f} / {rank}")
+            rank = f"{rank_correlation(of_cause, key):.2f}" if is_telling(of_cause) else "–"
+            agreements.append(f"{error(of_cause, key):.3f} / {rank}")
         spread = f"{actual.mean():.2f} ± {actual.std():.2f}"
         rows.append((name, str(figures[name]["training_frames"]), f"{cause} ({len(actual)})", spread, *agreements))
     yield from table(("scene", "frames", "cause", "actual", "of the frame", "of the pose alone"), rows)
     yield ""
-    telling = sum(is_telling(found) for *_, found in found_cells)
+    telling = sum(is_telling(of_cause) for *_, of_cause in all_cells)
     for key, of_what in (("told", "Of rendered frames"), ("of_pose", "Of poses alone")):
-        wrong = [f"{cause} of {name}" for name, cause, one in found_cells if error(one, key) > ERROR]
+        wrong = [f"{cause} of {name}" for name, cause, one in all_cells if error(one, key) > ERROR]
         mixed = [
             f"{cause} of {name}"
-            for name, cause, one in found_cells
+            for name, cause, one in all_cells
             if is_telling(one) and rank_correlation(one, key) < RANK
         ]
         listed, disordered = (", ".join(names) or "none" for names in (wrong, mixed))
-        yield f"{of_what}, {len(wrong)} of {len(found_cells)} errors are above {ERROR:g}: {listed}."
+        yield f"{of_what}, {len(wrong)} of {len(all_cells)} errors are above {ERROR:g}: {listed}."
         yield f"{len(mixed)} of {telling} rank correlations are below {RANK:g}: {disordered}."
         yield ""
-    pixels = ({"scene": name, "cause": cause, **found["uncertainty"]} for name, cause, found in found_cells)
+    pixels = ({"scene": name, "cause": cause, **of_cause["uncertainty"]} for name, cause, of_cause in all_cells)
     numbers = {"expected": "{expected:.3f}", "actual": "{actual:.3f}"}
     shares = {"within 1σ": "{within_1:.0%}", "within 2σ": "{within_2:.0%}"}
     yield from columns(pixels, {"scene": "{scene}", "cause": "{cause}", **numbers, **shares})

@@ -106,11 +106,11 @@ def picture_views() -> dict[str, tuple[Probe | None, FloatArray]]:  # poses [4, 
 
 def write_pictures(scene: GaussianScene, folder: Path) -> None:
     """Writes `demo_<view>.png` of each of `picture_views` into an existing folder, true to scale."""
-    for view, (asked, pose) in picture_views().items():
-        probe = scene.info.probe_or(asked)
+    for view, (own_probe, pose) in picture_views().items():
+        probe = scene.info.probe_or(own_probe)
         frames = render(scene, probe, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",))
-        shown = show(frames, probe, true_to_scale(probe, PICTURE_SIDE, PICTURE_SIDE))["bmode"]
-        write_whole(folder / f"demo_{view}.png", png_file(shown[0].numpy()))
+        picture = show(frames, probe, true_to_scale(probe, PICTURE_SIDE, PICTURE_SIDE))["bmode"]
+        write_whole(folder / f"demo_{view}.png", png_file(picture[0].numpy()))
 
 
 if __name__ == "__main__":

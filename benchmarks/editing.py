@@ -49,11 +49,11 @@ Change = Callable[[GaussianScene, InsertEdit], GaussianScene]
 
 def insertions(first: int, _: Path) -> Document:
     scene = load_demo_scene()
-    found = [changes(scene, seed, insert) for seed in range(first, first + BATCH)]
+    results = [changes(scene, seed, insert) for seed in range(first, first + BATCH)]
     controls = [changes(scene, seed, with_gap)[0] for seed in range(first, first + CONTROLS)]
     return {
-        "changes": [round(one[0], 4) for one in found],
-        "label_errors_pixels": [round(one[1], 3) for one in found],
+        "changes": [round(one[0], 4) for one in results],
+        "label_errors_pixels": [round(one[1], 3) for one in results],
         "controls": [round(one, 4) for one in controls],
     }
 
@@ -140,8 +140,8 @@ def drawn(scene: GaussianScene, poses: np.ndarray) -> torch.Tensor:  # [C, 4, 4]
 
 def against(scene: GaussianScene, sweep: Sweep) -> float:
     size = {"height": sweep.height, "width": sweep.width, "outputs": ("bmode",)}
-    found = render(scene, sweep.probe, sweep.poses, **size)["bmode"].numpy()
-    squares = np.square(found - sweep.images / 255.0).mean(axis=(1, 2))
+    bmode = render(scene, sweep.probe, sweep.poses, **size)["bmode"].numpy()
+    squares = np.square(bmode - sweep.images / 255.0).mean(axis=(1, 2))
     return float(np.mean(-10.0 * np.log10(squares)))
 
 
@@ -150,22 +150,22 @@ def thinning(_: Path) -> Document:
     poses = demo.training_poses[::10]
     whole = drawn(demo, poses)
     mixed = np.random.default_rng(0).permutation(demo.gaussian_count)
-    found: Document = {}
+    scores: Document = {}
     for share in SHARES:
         count = round(share * demo.gaussian_count)
         thinned = edit_scene(demo, [ThinEdit(gaussian_count=count)])
         at_random = part(demo, np.sort(mixed[:count]))
-        found[f"{share:g}"] = {
+        scores[f"{share:g}"] = {
             name: psnr(drawn(one, poses), whole) for name, one in (("chosen", thinned), ("random", at_random))
         }
-    return found
+    return scores
 
 
 def psnr(frames: torch.Tensor, truth: torch.Tensor) -> float:  # [C, H, W] both
     return float((-10.0 * (frames - truth).square().mean(dim=(1, 2)).log10()).mean())
 
 
-def told(measured: Document) -> Lines:
+def lines(measured: Document) -> Lines:
     """The table of the documents."""
     merged, thinned = measured["merging"], measured["thinning"]
     batches = [one for name, one in measured.items() if name.startswith("insertions")]
@@ -187,7 +187,7 @@ def told(measured: Document) -> Lines:
         one = thinned[share]
         what = f"PSNR with {float(share):.0%} of the Gaussians; of as many at random, dB"
         rows.append((what, f"{one['chosen']:.1f}; {one['random']:.1f}"))
-    return columns([{"what": what, "found": found} for what, found in rows], {"Measured": "{what}", "": "{found}"})
+    return columns([{"what": what, "found": value} for what, value in rows], {"Measured": "{what}", "": "{found}"})
 
 
 RUNS = {

@@ -92,8 +92,8 @@ def to_record(name: str, here: str) -> Document:
 
     Raises NotRecordable where the commit has not been measured.
     """
-    found = read(staged(name))
-    fresh = found if "measured" in found else {run: one for run, one in found.items() if _is_of(one, here)}
+    document = read(staged(name))
+    fresh = document if "measured" in document else {run: one for run, one in document.items() if _is_of(one, here)}
     if fresh.get("quick"):
         raise NotRecordable(f"{staged(name)} is of a quick run; measure it whole with make {TARGETS[name]}")
     if not fresh or ("measured" in fresh and not _is_of(fresh, here)):
@@ -132,7 +132,7 @@ def on_a_gpu(**patterns: str) -> Callable[[Document], Lines]:
 
 def frames(measured: Document) -> Lines:
     """The kernel and the front doors, and the memory of a worker process."""
-    shown = of_rows(
+    row_lines = of_rows(
         What="{what}",
         Gaussians="{gaussians:,}",
         Threads="{threads}",
@@ -142,7 +142,7 @@ def frames(measured: Document) -> Lines:
         **{"Frames/s": "{frames_per_s:.0f}"},
         Above_kernel_ms="{above_kernel_ms:.2f}",
     )
-    yield from shown(measured)
+    yield from row_lines(measured)
     memory = ", ".join(f"{int(count):,} Gaussians {mb:.0f} MB" for count, mb in measured["worker_memory_mb"].items())
     yield from ("", f"Memory of a worker process: with {memory}.")
 
@@ -168,7 +168,7 @@ def frames_at_a_glance(measured: Document) -> Lines:
 
 def parts(measured: Document) -> Lines:
     """The parts of a frame in the kernel, and its work."""
-    shown = {
+    cells = {
         "Scene": "{what}",
         "Instructions": "{instruction_set}",
         "Frame ms": "{frame_ms:.2f}",
@@ -183,13 +183,13 @@ def parts(measured: Document) -> Lines:
         {**row, "modelled": ", ".join(f"{speedup:.1f}" for speedup in row["modelled_speedups"].values())}
         for row in measured["rows"]
     )
-    return columns(rows, shown)
+    return columns(rows, cells)
 
 
 def clients(measured: Document) -> Lines:
     """What each kind of client gets."""
     extent, by_client = measured["extent"], measured["clients"]
-    shown = {
+    patterns = {
         f"Control loop, gRPC stream at 60 Hz for {extent['loop_s']:.0f} s, mode `latest`": (
             "control loop",
             "p50 {p50_ms:.1f}, p99 {p99_ms:.1f}, p99.9 {p99.9_ms:.1f} ms; jitter {jitter_ms:.1f} ms; {dropped:.0f} of "
@@ -211,7 +211,7 @@ def clients(measured: Document) -> Lines:
     def filled(pattern: str, values: Document) -> str:  # a dot in a key is none of an attribute
         return pattern.replace("p99.9_ms", "p999_ms").format_map({k.replace(".", ""): v for k, v in values.items()})
 
-    return table(("Client", "Measured"), ((what, filled(p, by_client[name])) for what, (name, p) in shown.items()))
+    return table(("Client", "Measured"), ((what, filled(p, by_client[name])) for what, (name, p) in patterns.items()))
 
 
 def seats(measured: Document) -> Lines:
@@ -242,9 +242,9 @@ def shards(measured: Document) -> Lines:
     extent, workers = measured["extent"], measured["extent"]["workers"]
     rows = [(f"kernel alone, {workers} processes of one thread", f"{measured['kernel_frames_per_s']:,.0f}", "", "")]
     for engine, name in (("queue", "queue"), ("ray", "Ray")):
-        if (found := measured.get(engine)) is not None:
-            share = f"{found['share_of_kernel']:.0%}"
-            rows.append((f"{name}, {workers} workers", f"{found['frames_per_s']:,.0f}", share, str(found["kills"])))
+        if (figures := measured.get(engine)) is not None:
+            share = f"{figures['share_of_kernel']:.0%}"
+            rows.append((f"{name}, {workers} workers", f"{figures['frames_per_s']:,.0f}", share, str(figures["kills"])))
     what = f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}, {extent['shards']} shards"
     return table((what, "Frames/s", "Of the kernel", "Killed in the second half"), rows)
 
@@ -295,7 +295,7 @@ def operations_of_a_frame(measured: Document) -> Lines:
 
 def console(measured: Document) -> Lines:
     """The console in Chromium."""
-    shown = {
+    texts = {
         "A sweep played at 512x512 for {seconds:.0f} s": (
             "{frames_per_s[median]:.0f} frames/s, {frames_per_s[least]:.0f} in its slowest ten seconds"
         ),
@@ -309,7 +309,7 @@ def console(measured: Document) -> Lines:
     }
     paint_s, image_s = (measured[name] / 1000 for name in ("first_contentful_paint_ms", "first_image_ms"))
     known = {**measured, "first_paint_s": paint_s, "first_image_s": image_s}
-    return table(("What", "Measured"), ([text.format_map(known) for text in row] for row in shown.items()))
+    return table(("What", "Measured"), ([text.format_map(known) for text in row] for row in texts.items()))
 
 
 def environment(measured: Document) -> Lines:
@@ -406,9 +406,9 @@ BLOCKS = {
     "hand": Block("hand", hand.predicted, hand.of_paths),
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "compressed": Block("compressed", compressed.kept),
-    "editing": Block("editing", editing.told),
-    "motion": Block("motion", motion.told),
-    "from_labels": Block("from_labels", from_labels.told),
+    "editing": Block("editing", editing.lines),
+    "motion": Block("motion", motion.lines),
+    "from_labels": Block("from_labels", from_labels.lines),
     "localization": Block("localization", localization.found_frames),
     "frames in motion": Block("localization", localization.frames_in_motion, localization.of_motion),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
@@ -441,20 +441,20 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 def show(target: str) -> None:
     """Print the tables of what a target measured."""
     for name, one in BLOCKS.items():
-        if TARGETS[one.source] != target or not (found := read(staged(one.source))):
+        if TARGETS[one.source] != target or not (figures := read(staged(one.source))):
             continue
-        if one.part(found := _beside_kept(one.source, found)):
-            sys.stdout.write("\n".join((f"# {name}", "", *one.of(found), "", "")))
+        if one.part(figures := _beside_kept(one.source, figures)):
+            sys.stdout.write("\n".join((f"# {name}", "", *one.of(figures), "", "")))
 
 
 def listing() -> Iterator[str]:
     """Each file with its origin, and how many commits of the product have come since."""
     for name in TARGETS:
-        if not (found := read(kept(name))):
+        if not (figures := read(kept(name))):
             yield f"{name}: not measured yet (make {TARGETS[name]} RECORD=1)"
             continue
-        yield f"{name}: {described(found)}"
-        for of in sorted({str(head["commit"]).removesuffix(DIRTY) for head in heads(found)}):
+        yield f"{name}: {described(figures)}"
+        for of in sorted({str(head["commit"]).removesuffix(DIRTY) for head in heads(figures)}):
             command = ["git", "-C", str(measuring.ROOT), "rev-list", "--count", f"{of}..HEAD", "--"]
             command += ["model", "workers", "service"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -466,25 +466,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("do", choices=("ready", "record", "show", "list", "check"))
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(TARGETS))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        if given.do == "ready" or (given.do == "record" and given.names):
+        if arguments.do == "ready" or (arguments.do == "record" and arguments.names):
             here = recordable_commit()
-            for name, document in {name: to_record(name, here) for name in given.names}.items():
+            for name, document in {name: to_record(name, here) for name in arguments.names}.items():
                 write_whole(kept(name), json.dumps(document, indent=1, allow_nan=False) + "\n")
                 if name == "confidence":
                     confidence.draw(document)
     except NotRecordable as error:
         sys.exit(f"error: {error}")
-    if given.do == "show":
-        show(*given.names)
-    if given.do == "list":
+    if arguments.do == "show":
+        show(*arguments.names)
+    if arguments.do == "list":
         sys.stdout.writelines(f"{line}\n" for line in listing())
-    if given.do in ("record", "check"):
+    if arguments.do in ("record", "check"):
         for page in documents():
             text = page.read_text(encoding="utf-8")
             if (new := current(text)) != text:
-                if given.do == "check":
+                if arguments.do == "check":
                     name = page.relative_to(measuring.ROOT)
                     sys.exit(f"error: {name} is not what the figures say: run benchmarks/figures.py record")
                 write_whole(page, new)

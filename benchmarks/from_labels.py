@@ -57,7 +57,7 @@ def block(attenuation: float, frequency_mhz: float) -> GaussianScene:
 
 
 def theory(_: Path) -> Document:
-    found: list[Document] = []
+    slopes: list[Document] = []
     for _, attenuation in SLOPES:
         for frequency in FREQUENCIES_MHZ:
             scene = block(attenuation, frequency)
@@ -67,13 +67,13 @@ def theory(_: Path) -> Document:
             inner = (depths > 4.0) & (depths < 32.0)
             slope = 600.0 * float(np.polyfit(depths[inner], level[inner], 1)[0])  # dB/cm
             expected = -2.0 * frequency * (attenuation - COMPENSATED)
-            found.append({"attenuation": attenuation, "mhz": frequency, "db_per_cm": slope, "expected": expected})
+            slopes.append({"attenuation": attenuation, "mhz": frequency, "db_per_cm": slope, "expected": expected})
     scene = block(COMPENSATED, 5.0)
     settings = FrameSettings(height=320, width=240, speckle="natural").resolved(scene.info, Encoding.FLOAT32)
     level_db = 60.0 * render_shown(scene, settings, scene.training_poses[::2])["bmode"].numpy()[:, 40:280, 20:220]
     amplitude = 10.0 ** (level_db / 20.0)
     return {
-        "slopes": [{name: round(value, 4) for name, value in one.items()} for one in found],
+        "slopes": [{name: round(value, 4) for name, value in one.items()} for one in slopes],
         "speckle_snr": float(amplitude.mean() / amplitude.std()),
         "speckle_db": float(level_db.std()),
     }
@@ -83,18 +83,18 @@ def spine(_: Path) -> Document:
     recipe, space = spine_recipe()
     poses = freehand_poses(9, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[3 : 3 + SPINE_FRAMES]
     scene = scene_from_labels(recipe, space=space, poses=freehand_poses(91))
-    made = drawn(scene, poses, speckle=False)
+    bmode = drawn(scene, poses, speckle=False)
     truth = simulated(SPINE, PHANTOM_PROBE, poses)
     labels = tissues(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
-    smooth = functional.avg_pool2d(torch.from_numpy(np.stack([made, truth])), 5, 1, 2).numpy()
+    smooth = functional.avg_pool2d(torch.from_numpy(np.stack([bmode, truth])), 5, 1, 2).numpy()
     means = {
-        tissue.name.lower(): [round(float(one[labels == tissue].mean()), 4) for one in (made, truth)]
+        tissue.name.lower(): [round(float(one[labels == tissue].mean()), 4) for one in (bmode, truth)]
         for tissue in Tissue
         if (labels == tissue).sum() > 200
     }
     return {
         "grey_levels": means,
-        "psnr_db": psnr(made, truth),
+        "psnr_db": psnr(bmode, truth),
         "smooth_psnr_db": psnr(smooth[0], smooth[1]),
         "smooth_correlation": float(np.corrcoef(smooth[0].ravel(), smooth[1].ravel())[0, 1]),
     }
@@ -121,33 +121,33 @@ def detector(_: Path) -> Document:
     test, refine = frames[: len(test_poses)], frames[len(test_poses) :]
     targets = np.isin(tissues(test_poses, probe=ABDOMEN_PROBE, height=SIDE, width=SIDE, phantom=ABDOMEN), TARGETS)
     recipe, space = abdomen_recipe(gaussian_count=GAUSSIANS)
-    made = scene_from_labels(recipe, space=space)
+    start = scene_from_labels(recipe, space=space)
     sweep = Sweep(np.round(255.0 * refine).astype(np.uint8), refine_poses, ABDOMEN_PROBE, np.arange(len(refine)), "few")
     none = sweep.select(np.zeros(0, int))
     config = TrainingConfig(steps=REFINE_STEPS, confidence=False, refine_poses="none", batch_size=4)
-    refined = train(Dataset("few", train=sweep, val=none), config, start=made)
-    found: Document = {"test_frames": len(test), "refining_frames": len(refine), "pixels": int(targets.sum())}
+    refined = train(Dataset("few", train=sweep, val=none), config, start=start)
+    figures: Document = {"test_frames": len(test), "refining_frames": len(refine), "pixels": int(targets.sum())}
     random = np.random.default_rng(0)
     poses = varied(random, MADE_FRAMES)
     masks = np.isin(tissues(poses, probe=ABDOMEN_PROBE, height=SIDE, width=SIDE, phantom=ABDOMEN), TARGETS)
-    for name, scene in (("made", made), ("refined", refined)):
+    for name, scene in (("made", start), ("refined", refined)):
         images = drawn(scene, poses, speckle=True)
         scores = [scored(trained(images, masks, seed), test, targets) for seed in range(SEEDS)]
-        found[name] = {
+        figures[name] = {
             **{key: float(np.mean([score[key] for score in scores])) for key in scores[0]},
             "dices": [score["dice"] for score in scores],
             "psnr_db": psnr(drawn(scene, test_poses, speckle=False), test),
         }
-    return found
+    return figures
 
 
 def scored(network: nn.Module, frames: np.ndarray, targets: np.ndarray) -> dict[str, float]:
     with torch.no_grad():
-        found = network(as_input(frames)).numpy()[:, 0] > 0.0
-    both = float((found & targets).sum())
+        mask = network(as_input(frames)).numpy()[:, 0] > 0.0
+    both = float((mask & targets).sum())
     return {
-        "dice": 2.0 * both / max(1, found.sum() + targets.sum()),
-        "precision": both / max(1, found.sum()),
+        "dice": 2.0 * both / max(1, mask.sum() + targets.sum()),
+        "precision": both / max(1, mask.sum()),
         "recall": both / targets.sum(),
     }
 
@@ -203,7 +203,7 @@ class Detector(nn.Module):
         return self.last(torch.cat([fine, coarse], dim=1))
 
 
-def told(measured: Document) -> Lines:
+def lines(measured: Document) -> Lines:
     """The table of the documents, of what is measured."""
     of_theory, of_spine, of_detector = (measured.get(name) for name in RUNS)
     rows = []
@@ -216,7 +216,7 @@ def told(measured: Document) -> Lines:
             ("deviation of its logarithm, dB (theory 5.57)", f"{of_theory['speckle_db']:.2f}"),
         ]
     if of_spine is not None:
-        levels = [abs(made - truth) for made, truth in of_spine["grey_levels"].values()]
+        levels = [abs(own - truth) for own, truth in of_spine["grey_levels"].values()]
         smooth = f"{of_spine['smooth_psnr_db']:.1f}; {of_spine['smooth_correlation']:.2f}"
         rows += [
             ("Spine, made and simulated: difference of a tissue's grey, mean", f"{np.mean(levels):.3f}"),
@@ -231,7 +231,7 @@ def told(measured: Document) -> Lines:
             what = f"Detector trained on {words}: Dice (of {len(one['dices'])} trainings); precision; recall"
             dice = f"{one['dice']:.2f} ({min(one['dices']):.2f} to {max(one['dices']):.2f})"
             rows.append((what, f"{dice}; {one['precision']:.2f}; {one['recall']:.2f}"))
-    return columns([{"what": what, "found": found} for what, found in rows], {"Measured": "{what}", "": "{found}"})
+    return columns([{"what": what, "found": value} for what, value in rows], {"Measured": "{what}", "": "{found}"})
 
 
 RUNS = {"theory": theory, "spine": spine, "detector": detector}

@@ -48,24 +48,24 @@ TRAINED = {  # scenes, by the names of their runs
 
 def measure(sweep: str, error: str, data_folder: Path) -> Document:
     """Held-out frames predicted linearly by three kinds of poses, and what is left of the poses' errors."""
-    given, true = _recorded(sweep, error), _recorded(sweep, "none")
+    recording, true = _recorded(sweep, error), _recorded(sweep, "none")
     began_s = time.perf_counter()
-    path = agreed_path(given)
+    path = agreed_path(recording)
     seconds = time.perf_counter() - began_s
     if path is None:
         raise AssertionError("a sweep of a hand has three frames in a row")
     with_true = replace(
-        given,
-        train=replace(given.train, poses=true.train.poses),
-        val=replace(given.val, poses=true.val.poses),
+        recording,
+        train=replace(recording.train, poses=true.train.poses),
+        val=replace(recording.val, poses=true.val.poses),
     )
     return {
-        "as_given": _scores(given, "linear"),
-        "on_path": _scores(path.of(given), "linear"),
+        "as_given": _scores(recording, "linear"),
+        "on_path": _scores(path.of(recording), "linear"),
         "true_poses": _scores(with_true, "linear"),
         "without_error": _scores_without_error(sweep),
-        "in_time": _scores(given, IN_TIME),
-        "error": deviation(true.train, given.train.poses),
+        "in_time": _scores(recording, IN_TIME),
+        "error": deviation(true.train, recording.train.poses),
         "left": deviation(true.train, path.train),
         "noise_mm": path.noise.position_mm,
         "noise_deg": path.noise.turn_deg,
@@ -78,12 +78,12 @@ def measure(sweep: str, error: str, data_folder: Path) -> Document:
 
 def measure_scene(sweep: str, error: str, data_folder: Path) -> Document:
     """Scenes by the preset fast, without the agreed path and on it."""
-    given, found = _recorded(sweep, error), {}
+    recording, scores = _recorded(sweep, error), {}
     for mode in ("none", "path"):
-        trained = train_and_evaluate(given, TrainingConfig.preset("fast", refine_poses=mode))
-        rows = score_held_out(trained.scene, given, trained.evaluation).to_dict()
-        found[mode] = {name: row["mean"] for name, row in rows.items() if row is not None}
-    return found
+        trained = train_and_evaluate(recording, TrainingConfig.preset("fast", refine_poses=mode))
+        rows = score_held_out(trained.scene, recording, trained.evaluation).to_dict()
+        scores[mode] = {name: row["mean"] for name, row in rows.items() if row is not None}
+    return scores
 
 
 def _recorded(sweep: str, error: str) -> Dataset:
@@ -127,8 +127,8 @@ def predicted(figures: Document) -> Lines:
             cost_db = best - before
             regained = f"{(after - before) / cost_db:.0%}" if cost_db >= LEAST_COST_DB else ""
             scores = [f"{before:.2f} / {run['as_given']['gmsd']:.3f}", f"{after:.2f} / {run['on_path']['gmsd']:.3f}"]
-            left = ", ".join(f"{run['error'][unit]:.2f} → {run['left'][unit]:.2f}{name}" for unit, name in UNITS)
-            rows.append((sweep, error, *scores, f"{true:.2f}", regained, left, f"{run['in_time']['psnr_db']:.2f}"))
+            residuals = ", ".join(f"{run['error'][unit]:.2f} → {run['left'][unit]:.2f}{name}" for unit, name in UNITS)
+            rows.append((sweep, error, *scores, f"{true:.2f}", regained, residuals, f"{run['in_time']['psnr_db']:.2f}"))
     head = ("sweep", "error", "as given", "on the path", "true poses", "regained", "error of poses", "in time")
     return table(head, rows)
 

@@ -96,11 +96,11 @@ def followed(sweep: Sweep, kills: int) -> list[Version]:
                 if kills_at and arrived >= kills_at[0]:
                     kills_at.pop(0)
                     raise Killed
-                found = super().next(most)
-                if found is None and arrived == len(sweep) and self.dataset is None:
+                update = super().next(most)
+                if update is None and arrived == len(sweep) and self.dataset is None:
                     self.dataset = Dataset("sweep", *split_sequence(sweep, len(sweep), None, None))
-                    found = super().next(most)
-                return found
+                    update = super().next(most)
+                return update
 
         class Live(_Live):
             """Notes what it serves."""
@@ -128,12 +128,12 @@ def psnrs_db(scene: GaussianScene, recorded: Sweep, on_path: Sweep) -> np.ndarra
     """PSNR of a scene on held-out frames: at the poses of the path that it was trained on, as that of `fast` is; of a
     scene that took poses as they came at those.
     """
-    found: list[float] = []
+    values: list[float] = []
     sweep = recorded if scene.rest_poses is None and scene.pose_corrections is None else on_path
     for some, frames in rendered_parts(scene.at_rest(), sweep, ("bmode",), "auto"):
         truth = torch.from_numpy(some.images).float().div_(255.0)
-        found += [one.psnr_db for one in frame_metrics(frames["bmode"].float(), truth)]
-    return np.array(found)
+        values += [one.psnr_db for one in frame_metrics(frames["bmode"].float(), truth)]
+    return np.array(values)
 
 
 def run(name: str, data_folder: Path) -> Document:
@@ -145,15 +145,15 @@ def run(name: str, data_folder: Path) -> Document:
     arrivals_s = np.arange(HELD_OUT_START, len(sweep), HELD_OUT_STEP) / RATE_HZ
     frames = part.val, PoseRefinement.of(part, "path").dataset.val
     versions = followed(sweep, 0)
-    shown = np.stack([psnrs_db(one.scene, *frames) for one in versions])  # [V, F]
+    scores_db = np.stack([psnrs_db(one.scene, *frames) for one in versions])  # [V, F]
     times_s = np.array([one.at_s for one in versions])
     waits_s = []
     for place, arrival_s in enumerate(arrivals_s):
-        good = times_s[(shown[:, place] >= linear[place]) & (times_s >= arrival_s)]
+        good = times_s[(scores_db[:, place] >= linear[place]) & (times_s >= arrival_s)]
         waits_s.append(float(good[0] - arrival_s) if len(good) else None)
     known = [wait_s for wait_s in waits_s if wait_s is not None]
     back = [0.0]
-    for before, after, at_s in zip(shown, shown[1:], times_s, strict=False):
+    for before, after, at_s in zip(scores_db, scores_db[1:], times_s, strict=False):
         if (there := arrivals_s <= at_s).any():
             back.append(float((before - after)[there].mean()))
     killed = followed(sweep, KILLS)
@@ -169,7 +169,7 @@ def run(name: str, data_folder: Path) -> Document:
         "linear_db": float(linear.mean()),
         "fast_db": float(fast.info.metrics["psnr_db"]),
         "fast_s": time.process_time() - begun_s,
-        "live_db": float(shown[at_end].mean()),
+        "live_db": float(scores_db[at_end].mean()),
         "killed_db": float(psnrs_db(killed[-1].scene, *frames).mean()),
         "settled_after_s": float(times_s[-1] - (len(sweep) - 1) / RATE_HZ),
         "versions": len(versions),

@@ -91,10 +91,10 @@ def in_motion(_: Path) -> Document:
     }
     rows = {}
     for way, locate in ways.items():
-        found, wall_s, cpu_s = zip(*(timed(partial(locate, image)) for image in images[1:]), strict=True)
+        results, wall_s, cpu_s = zip(*(timed(partial(locate, image)) for image in images[1:]), strict=True)
         rows[way] = {
-            **scores(motions, np.stack([one.pose for one in found]), poses[1:]),
-            "is_found": float(np.mean([one.is_found for one in found])),
+            **scores(motions, np.stack([one.pose for one in results]), poses[1:]),
+            "is_found": float(np.mean([one.is_found for one in results])),
             **{f"{name}_ms": 1000.0 * float(np.median(took)) for name, took in (("wall", wall_s), ("cpu", cpu_s))},
         }
     return {"frames": len(poses) - 1, "rows": rows, "index_s": index_s, "load": os.getloadavg()[0]}
@@ -103,8 +103,8 @@ def in_motion(_: Path) -> Document:
 def timed(locate: Callable[[], Localization]) -> tuple[Localization, float, float]:
     """What is found, the time that it takes, and the CPU time."""
     began_s = time.perf_counter(), time.process_time()
-    found = locate()
-    return found, time.perf_counter() - began_s[0], time.process_time() - began_s[1]
+    result = locate()
+    return result, time.perf_counter() - began_s[0], time.process_time() - began_s[1]
 
 
 def trained(dataset: Dataset, true: FloatArray | None = None) -> HeldOut:  # [V, 4, 4] mm
@@ -119,35 +119,35 @@ def row(held_out: HeldOut) -> Document:
     """What became of the frames: errors by each kind of poses, and CPU time of each search."""
     scene, sweep = held_out.scene, held_out.sweep
     motions, random = Motions.of(sweep.probe), np.random.default_rng(0)
-    found, apart_mm, took_s = [], [], []
+    results, apart_mm, took_s = [], [], []
     for image, pose in zip(sweep.images, sweep.poses, strict=True):
         start = displaced(pose, motions, random)
         began_s = time.process_time()
-        found.append(localize(scene, image, start))
+        results.append(localize(scene, image, start))
         took_s.append(time.process_time() - began_s)
-        apart_mm.append(between(motions, found[-1].pose, localize(scene, image, pose).pose)[0])
-    poses = np.stack([one.pose for one in found])
+        apart_mm.append(between(motions, results[-1].pose, localize(scene, image, pose).pose)[0])
+    poses = np.stack([one.pose for one in results])
     errors = {
         "recorded": (poses, sweep.poses),
         "on_path": (scene.poses_at_rest(poses), held_out.on_path),
         "true": (poses, held_out.true),
     }
     own, right = next(errors[kind] for kind in ("true", "on_path", "recorded") if errors[kind][1] is not None)
-    ratios = deviations_of(motions, found, own, right)
+    ratios = deviations_of(motions, results, own, right)
     return {
-        "frames": len(found),
+        "frames": len(results),
         **{name: None if right is None else scores(motions, own, right) for name, (own, right) in errors.items()},
         **{f"within_{count}": float(np.mean(ratios < count)) for count in (1, 2)},
         "same_place": float(np.mean([one < SAME_MM for one in apart_mm])),
-        "is_found": float(np.mean([one.is_found for one in found])),
+        "is_found": float(np.mean([one.is_found for one in results])),
         "p50_cpu_s": float(np.median(took_s)),
         "p90_cpu_s": float(np.percentile(took_s, 90)),
     }
 
 
-def scores(motions: Motions, found: FloatArray, right: FloatArray) -> Document:  # [F, 4, 4] mm, both
+def scores(motions: Motions, poses: FloatArray, right: FloatArray) -> Document:  # [F, 4, 4] mm, both
     """The share of poses within FOUND_MM and FOUND_DEG, and the median errors."""
-    shifts_mm, turns_deg = np.transpose([between(motions, *pair) for pair in zip(found, right, strict=True)])
+    shifts_mm, turns_deg = np.transpose([between(motions, *pair) for pair in zip(poses, right, strict=True)])
     return {
         "within": float(np.mean((shifts_mm < FOUND_MM) & (turns_deg < FOUND_DEG))),
         "median_mm": float(np.median(shifts_mm)),

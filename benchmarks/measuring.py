@@ -67,13 +67,13 @@ def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threa
     parser = argparse.ArgumentParser(description=(about or "").partition("\n")[0])
     parser.add_argument("data_folder", type=Path, help="folder of the data sets")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="runs whose names begin so: " + ", ".join(runs))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if threads:
         torch.set_num_threads(threads)
-    wanted = [run for run in runs if given.only is None or run.startswith(tuple(given.only))]
+    wanted = [run for run in runs if arguments.only is None or run.startswith(tuple(arguments.only))]
     if min(at_once, len(wanted)) > 1:
-        program = [sys.executable, sys.argv[0], str(given.data_folder), "--only"]
+        program = [sys.executable, sys.argv[0], str(arguments.data_folder), "--only"]
         with ThreadPoolExecutor(at_once) as pool:
             list(pool.map(lambda run: subprocess.run([*program, run], check=True), wanted))
         return
@@ -83,7 +83,7 @@ def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threa
         if known is not None and known["measured"]["commit"] == head["commit"] and not is_dirty(head):
             continue
         log.info("%s", run)
-        figures = {**runs[run](given.data_folder), "measured": head}
+        figures = {**runs[run](arguments.data_folder), "measured": head}
         STAGE.mkdir(parents=True, exist_ok=True)
         with staged(name).with_suffix(".lock").open("w") as lock:  # another program may write what it has measured
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -126,13 +126,13 @@ def described(document: Document) -> str:
 
 def in_words(machine: Document) -> str:
     """A machine; figures of earlier commits do not say everything about theirs."""
-    found = {name: machine.get(name) for name in ("model", "threads", "cores", "memory_gib")}
-    threads = found["threads"] and f"{found['threads']} thread{'s'[: found['threads'] != 1]}"
+    facts = {name: machine.get(name) for name in ("model", "threads", "cores", "memory_gib")}
+    threads = facts["threads"] and f"{facts['threads']} thread{'s'[: facts['threads'] != 1]}"
     parts = (
-        machine["processor"] + (f" ({found['model']})" if found["model"] else ""),
+        machine["processor"] + (f" ({facts['model']})" if facts["model"] else ""),
         machine.get("instruction_set"),
-        " on ".join(filter(None, (threads, found["cores"] and f"{found['cores']} cores"))),
-        found["memory_gib"] and f"{found['memory_gib']:.0f} GiB",
+        " on ".join(filter(None, (threads, facts["cores"] and f"{facts['cores']} cores"))),
+        facts["memory_gib"] and f"{facts['memory_gib']:.0f} GiB",
     )
     return ", ".join(filter(None, parts))
 

@@ -55,9 +55,9 @@ def measure(name: str, data_folder: Path) -> Document:
 def summary(comparison: Comparison, data_folder: Path) -> Document:
     """What the tables say, without the figures of each frame and without the place of the data on this machine."""
     ranks = rank(comparison.measured)
-    found = {}
+    by_name = {}
     for result in comparison.results:
-        found[result.name] = {
+        by_name[result.name] = {
             "title": result.title,
             "failure": result.failure and result.failure.replace(f"{data_folder.resolve()}/", ""),
             "cost": dict(zip(COST_HEADINGS, cost_texts(result), strict=True)),
@@ -66,7 +66,7 @@ def summary(comparison: Comparison, data_folder: Path) -> Document:
         }
         if result.evaluation is not None:
             mean, std = result.evaluation.mean.to_dict(), result.evaluation.std.to_dict()
-            found[result.name] |= {"mean": mean, "std": std, "mean_rank": ranks[result.name].mean}
+            by_name[result.name] |= {"mean": mean, "std": std, "mean_rank": ranks[result.name].mean}
     return {
         "train_frames": comparison.dataset.train_frames,
         "val_frames": comparison.dataset.val_frames,
@@ -74,7 +74,7 @@ def summary(comparison: Comparison, data_folder: Path) -> Document:
         "budget_s": comparison.budget_s,
         "times": comparison.times,
         "order": by_mean_rank(comparison.measured),
-        "methods": found,
+        "methods": by_name,
     }
 
 
@@ -100,10 +100,10 @@ def methods(figures: Document) -> Lines:
 def _method(one: Document, means: Sequence[Document]) -> Iterator[str]:
     yield from (one["title"], *one["cost"].values())
     for metric in METRICS:
-        shown = shown_value(metric.name, one["mean"][metric.name])
+        text = shown_value(metric.name, one["mean"][metric.name])
         best = max((mean[metric.name] for mean in means), key=lambda value, sign=metric.sign: sign * value)
-        bold = "**" if shown == shown_value(metric.name, best) else ""
-        yield f"{bold}{shown}{bold}"
+        bold = "**" if text == shown_value(metric.name, best) else ""
+        yield f"{bold}{text}{bold}"
     yield f"{one['mean_rank']:.2f}"
 
 

@@ -63,9 +63,9 @@ def sweep_of(patient: GaussianScene, poses: np.ndarray, numbers: np.ndarray) -> 
 def psnr_db(scene: GaussianScene, held_out: Sweep, numbers: np.ndarray | None) -> float:
     errors = []
     for place, image in enumerate(held_out.images):
-        shown = scene if numbers is None else scene.at_phase((float(numbers[place]),))
+        phase_scene = scene if numbers is None else scene.at_phase((float(numbers[place]),))
         size = {"height": SIDE, "width": SIDE}
-        frame = render(shown, DEMO_PROBE, held_out.poses[place], **size, outputs=("bmode",)).bmode[0].numpy()
+        frame = render(phase_scene, DEMO_PROBE, held_out.poses[place], **size, outputs=("bmode",)).bmode[0].numpy()
         errors.append(-10.0 * np.log10(np.square(frame - image / 255.0).mean()))
     return round(float(np.mean(errors)), 2)
 
@@ -95,7 +95,7 @@ def trained(name: str, sweep: Sweep, held_out: Sweep, steps: int) -> GaussianSce
     return train(Dataset(name, sweep, held_out), config)
 
 
-def found(_: Path) -> Document:
+def found_numbers(_: Path) -> Document:
     """Numbers that nobody told; those of held-out frames follow from the true ones by a straight line."""
     _, numbers, breathing, held_out, held_numbers = recorded()
     moving, own = find_motion(trained("first", breathing, held_out, FIRST_STEPS), breathing)
@@ -124,8 +124,8 @@ def learned(_: Path) -> Document:
     at_rest = truth(np.array([mode.rest])).at(points)[0]
     full = truth(np.array([1.0]))
     wanted = full.at(points)[0] - at_rest
-    found = moving.at_phase((1.0,)).displacements[0].at(points + at_rest)[0]
-    off = (found - wanted).numpy()
+    displacements = moving.at_phase((1.0,)).displacements[0].at(points + at_rest)[0]
+    off = (displacements - wanted).numpy()
     return {
         "gaussians": moving.gaussian_count,
         "frames": len(poses),
@@ -154,9 +154,9 @@ def cost(_: Path) -> Document:
     fields = [truth(np.array([share])) for share in np.linspace(-0.5, 0.5, 10)]
     took: dict[str, list[tuple[float, float]]] = {"still": [], "moving": []}
     for turn in range(300):
-        for name, shown in (("still", scene), ("moving", scene.under(fields[turn % len(fields)]))):
+        for name, one_scene in (("still", scene), ("moving", scene.under(fields[turn % len(fields)]))):
             before = time.perf_counter(), time.process_time()
-            render(shown, probe, np.eye(4), height=512, width=512, outputs=("bmode",))
+            render(one_scene, probe, np.eye(4), height=512, width=512, outputs=("bmode",))
             took[name].append((time.perf_counter() - before[0], time.process_time() - before[1]))
     medians = {name: 1e3 * np.median(np.array(one), axis=0) for name, one in took.items()}
     more = 1e3 * np.median(np.array(took["moving"]) - np.array(took["still"]), axis=0)
@@ -169,16 +169,16 @@ def cost(_: Path) -> Document:
     }
 
 
-def told(measured: Document) -> Lines:
+def lines(measured: Document) -> Lines:
     """The table of the documents."""
-    learned, cost, found = measured["learned"], measured["cost"], measured.get("found")
+    learned, cost, by_search = measured["learned"], measured["cost"], measured.get("found")
     rows = [
         *((f"Held-out PSNR, {name}, dB", f"{psnr:.2f}") for name, psnr in learned["psnr_db"].items()),
-        *(() if found is None else [("Held-out PSNR, numbers found, dB", f"{found['psnr_db']:.2f}")]),
+        *(() if by_search is None else [("Held-out PSNR, numbers found, dB", f"{by_search['psnr_db']:.2f}")]),
         *(
             ()
-            if found is None
-            else [("Correlation of numbers found with the true ones", f"{found['correlation']:.2f}")]
+            if by_search is None
+            else [("Correlation of numbers found with the true ones", f"{by_search['correlation']:.2f}")]
         ),
         (
             "Field at full breath, root mean square error along the frames; in space, mm",
@@ -190,8 +190,8 @@ def told(measured: Document) -> Lines:
             f"{cost['more_ms']}; {cost['more_processor_ms']}",
         ),
     ]
-    return columns([{"what": what, "found": found} for what, found in rows], {"Measured": "{what}", "": "{found}"})
+    return columns([{"what": what, "found": value} for what, value in rows], {"Measured": "{what}", "": "{found}"})
 
 
 if __name__ == "__main__":
-    measure_runs("motion", __doc__, {"learned": learned, "found": found, "cost": cost}, threads=THREADS)
+    measure_runs("motion", __doc__, {"learned": learned, "found": found_numbers, "cost": cost}, threads=THREADS)

@@ -35,27 +35,27 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200, help="of a round, at each front door")
     parser.add_argument("--gaussians", type=int, default=90_000)
     parser.add_argument("--output", type=Path, help="also write the figures as JSON")
-    given = parser.parse_args()
-    checkouts, poses = [given.base, given.this], bench_poses(given.frames + WARM_UP)
+    arguments = parser.parse_args()
+    checkouts, poses = [arguments.base, arguments.this], bench_poses(arguments.frames + WARM_UP)
     p50_ms: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in MEASURED}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ultragray-paired-")))
-        BenchScene(given.gaussians, 0.05).scene.save(folder / f"{SCENE}.ugr")
+        BenchScene(arguments.gaussians, 0.05).scene.save(folder / f"{SCENE}.ugr")
         pythons = [str(checkout.absolute() / ".venv/bin/python") for checkout in checkouts]
         servers = [stack.enter_context(running_server(folder, "cpu", SCENE, python=python)) for python in pythons]
-        for number in range(given.rounds):
+        for number in range(arguments.rounds):
             for place in (0, 1) if number % 2 == 0 else (1, 0):
-                for name, found in p50_ms.items():
-                    found[place].append(statistics.median(DOORS[name](servers[place], poses).latency_ms))
+                for name, pair in p50_ms.items():
+                    pair[place].append(statistics.median(DOORS[name](servers[place], poses).latency_ms))
     commits = [_commit(checkout) for checkout in checkouts]
-    doors = {name: _compared(*found) for name, found in p50_ms.items()}
-    table = Table("", *commits, "ratio", title=f"{processor_name()}: p50 in ms, medians of {given.rounds} rounds")
+    doors = {name: _compared(*pair) for name, pair in p50_ms.items()}
+    table = Table("", *commits, "ratio", title=f"{processor_name()}: p50 in ms, medians of {arguments.rounds} rounds")
     for name, compared in doors.items():
         table.add_row(name, *(f"{figure:.3f}" for figure in compared.values()))
     Console().print(table)
-    if given.output is not None:
+    if arguments.output is not None:
         document = {"processor": processor_name(), "base": commits[0], "this": commits[1], "doors": doors}
-        given.output.write_text(json.dumps(document, indent=1) + "\n")
+        arguments.output.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _compared(base_ms: list[float], this_ms: list[float]) -> dict[str, float]:

@@ -76,8 +76,8 @@ def planned(seed: int) -> Sweep:
     poses = even(2, ROUNDS[0])
     box = f"{-HALF_MM}:{HALF_MM},{FIRST_MM}:{FIRST_MM + LENGTH_MM},-5:5"
     for count in ROUNDS[1:]:
-        asked = PlanSettings(want="coverage", within_mm=WITHIN_MM, views=count, box_mm=box, tilt_deg=TILT_DEG)
-        poses = np.concatenate([poses, plan_views(trained(scan(poses), seed), asked).poses])
+        settings = PlanSettings(want="coverage", within_mm=WITHIN_MM, views=count, box_mm=box, tilt_deg=TILT_DEG)
+        poses = np.concatenate([poses, plan_views(trained(scan(poses), seed), settings).poses])
     return scan(poses)
 
 

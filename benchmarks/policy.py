@@ -32,7 +32,7 @@ def measure(settings: dict[str, Any], _: Path) -> Document:
 
 def reached_planes(runs: Document) -> Lines:
     """The table of the documents."""
-    shown = {
+    cells = {
         "Learned from": "{way}",
         "Starts": "{starts}",
         "Reached the plane": "{reached:.0%}",
@@ -40,7 +40,7 @@ def reached_planes(runs: Document) -> Lines:
         "Mean confidence on the way": "{confidence:.2f}",
         "Processor time of learning": "{learned_s:.0f} s",
     }
-    return columns(({"way": way, **run} for way, run in runs.items()), shown)
+    return columns(({"way": way, **run} for way, run in runs.items()), cells)
 
 
 if __name__ == "__main__":

@@ -33,17 +33,17 @@ def measure(name: str, error: str, seed: int, data_folder: Path) -> Document:
     """Two trainings from the same poses, one that refines them; what is left of the errors after the second."""
     dataset = load_dataset(data_folder / name)
     true = dataset.train
-    given = replace(true, poses=with_errors(true, error, seed))
-    scores, refined = {}, given.poses
+    start = replace(true, poses=with_errors(true, error, seed))
+    scores, refined = {}, start.poses
     for mode in ("none", "frames"):
         config = TrainingConfig.preset("fast", refine_poses=mode, confidence=False, seed=seed)
-        trained = train_and_evaluate(replace(dataset, train=given), config)
+        trained = train_and_evaluate(replace(dataset, train=start), config)
         mean = trained.evaluation.mean
         scores[mode] = {"psnr_db": mean.psnr_db, "ms_ssim": mean.ms_ssim, "seconds": round(trained.course.seconds)}
         refined = trained.scene.training_poses
     return {
         **{f"{key}_{mode}": value for mode, score in scores.items() for key, value in score.items()},
-        "added": deviation(true, given.poses),
+        "added": deviation(true, start.poses),
         "left": deviation(true, refined),
     }
 

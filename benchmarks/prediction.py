@@ -79,9 +79,9 @@ def measured_at(rate_hz: float, noise: float, truth: Poses) -> Path_:
 def straight(times_s: FloatArray, poses: FloatArray, at_s: FloatArray) -> FloatArray:  # [C, 4, 4]
     place = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
     shares = (at_s - times_s[place - 1]) / (times_s[place] - times_s[place - 1])
-    found = poses[place - 1] + shares[:, None, None] * (poses[place] - poses[place - 1])
-    found[:, :3, :3] = blended(poses[place - 1, :3, :3], poses[place, :3, :3], shares)
-    return found
+    result = poses[place - 1] + shares[:, None, None] * (poses[place] - poses[place - 1])
+    result[:, :3, :3] = blended(poses[place - 1, :3, :3], poses[place, :3, :3], shares)
+    return result
 
 
 def measure(take: Callable[[Path], Path_], data_folder: Path) -> Document:
@@ -92,12 +92,12 @@ def measure(take: Callable[[Path], Path_], data_folder: Path) -> Document:
 def errors(times_s: FloatArray, poses: FloatArray, truth: Poses, ahead_s: float) -> Document:
     """Root mean square errors without and with prediction, and the ones that were told beside the frames."""
     seen_s = times_s + ahead_s * np.random.default_rng(2).uniform(1 - JITTER, 1 + JITTER, size=len(times_s))
-    path, foretold, told = PathPredictor(), [], []
+    path, foretold, expected = PathPredictor(), [], []
     for time_s, pose, at_s in zip(times_s, poses, seen_s, strict=True):
         path.observe(time_s, pose)
         there, prediction = path.predict(at_s)
         foretold.append(there)
-        told.append((prediction.error_mm or 0.0, prediction.error_deg or 0.0))
+        expected.append((prediction.error_mm or 0.0, prediction.error_deg or 0.0))
     known = seen_s <= times_s[-1]
     if not known.any():
         return {}
@@ -105,7 +105,7 @@ def errors(times_s: FloatArray, poses: FloatArray, truth: Poses, ahead_s: float)
     return {
         "without": rms(poses[known], true),
         "with": rms(np.stack(foretold)[known], true),
-        "told": np.sqrt(np.square(told)[known].mean(axis=0)).tolist(),
+        "told": np.sqrt(np.square(expected)[known].mean(axis=0)).tolist(),
         "at_best": at_best(times_s, poses, seen_s, truth),
     }
 
@@ -116,14 +116,14 @@ def at_best(times_s: FloatArray, poses: FloatArray, seen_s: FloatArray, truth: P
     true, rotations = truth(seen_s[known]), poses[:, :3, :3]
     walked = np.diff(poses[:, :3, 3], axis=0), turns_of(rotations[:-1].transpose(0, 2, 1) @ rotations[1:])
     motions = true[:, :3, 3] - poses[known, :3, 3], turns_of(rotations[known].transpose(0, 2, 1) @ true[:, :3, :3])
-    steps, left = max(1, min(STEPS, len(true) // POSES_A_STEP)), []
+    steps, residuals = max(1, min(STEPS, len(true) // POSES_A_STEP)), []
     for moves, right in zip(walked, motions, strict=True):
         speeds = np.concatenate([np.zeros((steps, 3)), moves / np.diff(times_s)[:, None]])  # none before the first pose
         last = np.stack([speeds[steps - back :][: len(poses)] for back in range(1, steps + 1)], axis=-1)  # [N, 3, S]
         foretold = (last * (seen_s - times_s)[:, None, None])[known].reshape(-1, steps)
         shares = np.linalg.lstsq(foretold, right.ravel(), rcond=None)[0]
-        left.append(float(np.sqrt(np.square(right.ravel() - foretold @ shares).sum() / len(true))))
-    return [left[0], float(np.degrees(left[1]))]
+        residuals.append(float(np.sqrt(np.square(right.ravel() - foretold @ shares).sum() / len(true))))
+    return [residuals[0], float(np.degrees(residuals[1]))]
 
 
 def rms(poses: FloatArray, true: FloatArray) -> list[float]:  # mm, degrees
@@ -138,7 +138,7 @@ def foretold_poses(runs: Document) -> Lines:
         "{without[0]:.2f} → {with[0]:.2f} ({at_best[0]:.2f}) mm, {without[1]:.2f} → {with[1]:.2f} ({at_best[1]:.2f})°"
     )
     rows = (
-        {"path": name, **{f"in {ms}": text.format_map(found) if found else "–" for ms, found in run["ahead"].items()}}
+        {"path": name, **{f"in {ms}": text.format_map(one) if one else "–" for ms, one in run["ahead"].items()}}
         for name, run in runs.items()
     )
     return columns(rows, {"Path": "{path}", **{f"{ms:,} ms": f"{{in {ms}}}" for ms in AHEAD_MS}})

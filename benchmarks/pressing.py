@@ -69,14 +69,14 @@ def finite_elements(layers: Layers, indentation_mm: float = INDENTATION_MM) -> t
             axis[dofs[d]] = d
     x, y, z = basis.doflocs
     face = (z == 0) & (x <= FACE_MM[0] / 2) & (y <= FACE_MM[1] / 2) & (axis == 2)
-    held = face | (z == floors[-1]) | ((x == 0) & (axis == 0)) | ((y == 0) & (axis == 1))
-    given = np.where(face, indentation_mm, 0.0)
+    is_fixed = face | (z == floors[-1]) | ((x == 0) & (axis == 0)) | ((y == 0) & (axis == 1))
+    shifts_mm = np.where(face, indentation_mm, 0.0)
 
     def solved(matrix: Any, right: FloatArray) -> FloatArray:
-        found: FloatArray = splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True}).solve(right)
-        return found
+        solution: FloatArray = splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True}).solve(right)
+        return solution
 
-    moved = solve(*condense(stiffness, basis.zeros(), x=given, D=np.flatnonzero(held)), solver=solved)
+    moved = solve(*condense(stiffness, basis.zeros(), x=shifts_mm, D=np.flatnonzero(is_fixed)), solver=solved)
     return basis.interpolator(moved), 4e-3 * float((stiffness @ moved)[face].sum())
 
 
@@ -117,18 +117,18 @@ def layered_scene(layers: Layers, count: int = 20_000, interface_mm: float | Non
     )
 
 
-def pressed(scene: GaussianScene, indentation_mm: float, **asked: Any) -> Frames:
+def pressed(scene: GaussianScene, indentation_mm: float, **options: Any) -> Frames:
     pose = np.eye(4)
     pose[2, 3] = indentation_mm
     size = {"height": SIDE, "width": SIDE, "outputs": ("echo",)}
-    return render(scene, None, pose, **{**size, **asked}, contact=Contact.PRESSURE)
+    return render(scene, None, pose, **{**size, **options}, contact=Contact.PRESSURE)
 
 
 def displaced_mm(frames: Frames, points: FloatArray) -> FloatArray:  # [N, 3] -> [N, 3]
     assert frames.pressing is not None
     assert frames.pressing.displacement is not None
-    found: FloatArray = frames.pressing.displacement.at(torch.from_numpy(points))[0].numpy()
-    return found
+    shifts_mm: FloatArray = frames.pressing.displacement.at(torch.from_numpy(points))[0].numpy()
+    return shifts_mm
 
 
 def beside_finite_elements(layers: Layers) -> Document:
@@ -198,9 +198,9 @@ def cost(_: Path) -> Document:
 
 
 def displacements(runs: Document) -> Lines:
-    found = runs["finite elements"]
+    figures = runs["finite elements"]
     yield from columns(
-        found["rows"],
+        figures["rows"],
         {
             "Layers": "{layers}",
             "Largest error under the face": "{worst:.1%}",
@@ -212,7 +212,7 @@ def displacements(runs: Document) -> Lines:
     )
     yield ""
     yield from columns(
-        found["interfaces"],
+        figures["interfaces"],
         {
             f"Interface at {INTERFACE_MM:g} mm in": "{layers}",
             "Pressed in by, mm": "{indentation_mm:g}",

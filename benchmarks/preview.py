@@ -96,7 +96,7 @@ def seen(moving: Moving, delay_s: float) -> Document:
     """Mean PSNR of what is seen in place of the present real frame, and its error beside the one that was told."""
     random = np.random.default_rng(1)
     comes_s = moving.times_s + delay_s * random.uniform(1.0 - JITTER, 1.0 + JITTER, len(moving.times_s))
-    preview, newest, told = Previewer(moving.probe), -1, []
+    preview, newest, expected = Previewer(moving.probe), -1, []
     errors: dict[str, list[float]] = {"late": [], "scene": [], "preview": []}  # mean squares, by frame
     for now, now_s in enumerate(moving.times_s):
         came = [k for k in range(newest + 1, now + 1) if comes_s[k] <= now_s]
@@ -105,17 +105,17 @@ def seen(moving: Moving, delay_s: float) -> Document:
         newest = max([newest, *came])
         if newest < 0 or now_s < delay_s + SETTLED_S:
             continue
-        shown = preview.show(moving.rendered[now], moving.poses[now])
-        pictures = {"late": moving.real[newest], "scene": moving.rendered[now], "preview": shown.frame}
+        preview_frame = preview.show(moving.rendered[now], moving.poses[now])
+        pictures = {"late": moving.real[newest], "scene": moving.rendered[now], "preview": preview_frame.frame}
         for name, picture in pictures.items():
             errors[name].append(float(np.mean((picture - moving.real[now]) ** 2)))
-        told.append(shown.expected_error or 0.0)
-    if not told:
+        expected.append(preview_frame.expected_error or 0.0)
+    if not expected:
         return {}
     return {
         **{f"{name}_db": float(-10.0 * np.log10(np.mean(one))) for name, one in errors.items()},
         "error": float(np.sqrt(np.mean(errors["preview"]))),
-        "told": float(np.sqrt(np.mean(np.square(told)))),
+        "told": float(np.sqrt(np.mean(np.square(expected)))),
     }
 
 
@@ -126,7 +126,7 @@ def previewed_frames(runs: Document) -> Lines:
         {
             "path": name,
             "scene": f"{run['delays']['300']['scene_db']:.1f} dB",
-            **{f"by {ms}": text.format_map(found) if found else "–" for ms, found in run["delays"].items()},
+            **{f"by {ms}": text.format_map(figures) if figures else "–" for ms, figures in run["delays"].items()},
         }
         for name, run in runs.items()
     )

@@ -108,8 +108,8 @@ def _on_path(scene: GaussianScene, dataset: Dataset) -> dict[str, Evaluation]:
 
 def _source(run: Run, data_folder: Path) -> Dataset:
     if run.source in IN_SILICO:
-        asked = IN_SILICO[run.source]()
-        return Dataset(run.source, train=asked.training, val=asked.unseen)
+        case = IN_SILICO[run.source]()
+        return Dataset(run.source, train=case.training, val=case.unseen)
     return load_dataset(run.source if run.source == PHANTOM else data_folder / run.source, run.options)
 
 
@@ -212,8 +212,8 @@ def _metrics(run: Document) -> Iterator[list[str]]:
         cells = [row_name]
         for key in _HEADS:
             mean = f"{means[method][key]:.{_digits(key)}f}"
-            shown = f"**{mean}**" if mean == f"{best[key]:.{_digits(key)}f}" else mean
-            cells.append(f"{shown} ± {run['metrics'][method]['std'][key]:.{_digits(key)}f}")
+            text = f"**{mean}**" if mean == f"{best[key]:.{_digits(key)}f}" else mean
+            cells.append(f"{text} ± {run['metrics'][method]['std'][key]:.{_digits(key)}f}")
         yield cells
 
 
@@ -235,13 +235,13 @@ def glanced_at(figures: Document) -> Document:
 
 def results_at_a_glance(figures: Document) -> Lines:
     """The README's table, of the runs that it shows."""
-    shown = "{psnr_db:.1f} dB, {ms_ssim:.3f}, {gmsd:.3f}"
+    text = "{psnr_db:.1f} dB, {ms_ssim:.3f}, {gmsd:.3f}"
     return table(
         ("PSNR, MS-SSIM, GMSD", "training", "this scene", "median compounding", "linear interpolation"),
         (
             (
                 *(README_ROWS[name], f"{run['total_s']:.0f} s"),
-                *(shown.format_map(run["metrics"][one]["mean"]) for one in ("scene", "median", "linear")),
+                *(text.format_map(run["metrics"][one]["mean"]) for one in ("scene", "median", "linear")),
             )
             for name, run in figures.items()
         ),

@@ -120,8 +120,8 @@ def _ask(rclpy: Any, peer: Any, publisher: Any, images: list[int], poses: Any, n
     began = time.monotonic()
     while number not in images:
         publisher.publish(pose)
-        sent = time.monotonic()
-        while number not in images and time.monotonic() - sent < 1.0:
+        sent_s = time.monotonic()
+        while number not in images and time.monotonic() - sent_s < 1.0:
             rclpy.spin_once(peer, timeout_sec=0.1)
         if time.monotonic() - began > TIMEOUT_S:
             raise TimeoutError(f"no image for pose {number} within {TIMEOUT_S:g} s")

@@ -70,7 +70,7 @@ def measure(name: str, data_folder: Path) -> Document:
     fit_s = time.perf_counter() - began
     held_out = dataset.val.select(spread_places(len(dataset.val), MOST_FRAMES))
     true = held_out.images.astype(np.float32) / 255.0
-    shown = {one.value: drawn(scene, held_out, one) for one in Speckle}
+    by_kind = {one.value: drawn(scene, held_out, one) for one in Speckle}
     model = scene.info.speckle
     assert model is not None
     return {
@@ -78,9 +78,9 @@ def measure(name: str, data_folder: Path) -> Document:
         "fit_s": fit_s,
         "model": model.__dict__ | {"strength": list(model.strength)},
         "psnr_db": evaluate(scene, held_out).mean.psnr_db,  # without speckle
-        "texture": {value: texture(frames, true, held_out) for value, frames in shown.items()},
+        "texture": {value: texture(frames, true, held_out) for value, frames in by_kind.items()},
         "decorrelation": decorrelation(scene, *pairs_of_frames(name, dataset)),
-        "area_under_curve": {value: area_under_curve(frames, true) for value, frames in shown.items()},
+        "area_under_curve": {value: area_under_curve(frames, true) for value, frames in by_kind.items()},
     }
 
 
@@ -94,18 +94,18 @@ def trained(name: str, dataset: Dataset) -> GaussianScene:
 
 
 def drawn(scene: GaussianScene, sweep: Sweep, speckle: Speckle) -> FrameArray:  # [F, H, W]
-    asked = {"height": sweep.height, "width": sweep.width, "outputs": ("bmode",), "speckle": speckle}
+    options = {"height": sweep.height, "width": sweep.width, "outputs": ("bmode",), "speckle": speckle}
     with torch.no_grad():
-        frames = [render(scene, sweep.probe, pose, **asked)["bmode"] for pose in sweep.poses]
+        frames = [render(scene, sweep.probe, pose, **options)["bmode"] for pose in sweep.poses]
     return np.asarray(torch.cat(frames).mul(255.0).round().div(255.0).numpy())  # in 8 bits, as true frames are
 
 
 def texture(frames: FrameArray, true: FrameArray, sweep: Sweep) -> Document:
     """How far statistics are from those of the true frames, as shares of these."""
-    found: SpeckleSummary = summarize(compare_speckle(frames, true, sweep.probe))
-    assert found.true is not None
-    assert found.rendered is not None
-    own, wanted = found.rendered.__dict__, found.true.__dict__
+    summary: SpeckleSummary = summarize(compare_speckle(frames, true, sweep.probe))
+    assert summary.true is not None
+    assert summary.rendered is not None
+    own, wanted = summary.rendered.__dict__, summary.true.__dict__
     counts = [np.histogram(one, GREYS, (0.0, 1.0))[0] / one.size for one in (frames, true)]
     return {
         **{name: own[name] / wanted[name] - 1.0 for name in wanted},
@@ -154,8 +154,8 @@ def decorrelation(scene: GaussianScene, part: Sweep, pairs: IntArray) -> Documen
     """Correlations of pairs of windows by their distance and their angle, of true and of rendered frames."""
     true = part.images.astype(np.float32) / 255.0
     windows = WindowPairs.between(true, part.poses, part.probe, pairs)
-    shown = {"true": true, **{one.value: drawn(scene, part, one) for one in Speckle}}
-    moments = {name: windows.moments(one) for name, one in shown.items()}
+    by_kind = {"true": true, **{one.value: drawn(scene, part, one) for one in Speckle}}
+    moments = {name: windows.moments(one) for name, one in by_kind.items()}
     upright = windows.angle_deg < UPRIGHT_DEG
     near = windows.elevation_mm < ELEVATION_MM[2]
     return {
@@ -169,9 +169,9 @@ def by_bins(values: FloatArray, edges: tuple[float, ...], moments: dict[str, Flo
     for low, high in pairwise(edges):
         chosen = among & (values >= low) & (values < high)
         if chosen.sum() >= LEAST_PAIRS:
-            found = {name: correlation(own[chosen]) for name, own in moments.items()}
+            correlations = {name: correlation(own[chosen]) for name, own in moments.items()}
             about = {"from": low, "to": high, "windows": int(chosen.sum())}
-            rows.append(about | found)
+            rows.append(about | correlations)
     return rows
 
 
@@ -181,7 +181,7 @@ def area_under_curve(frames: FrameArray, true: FrameArray) -> float:
     It sees windows without their means, for it is to tell texture.
     """
     torch.manual_seed(0)
-    (grey, labels), (unseen, told) = (labelled(frames[half], true[half]) for half in halves(len(true)))
+    (grey, labels), (unseen, truth) = (labelled(frames[half], true[half]) for half in halves(len(true)))
     scale = grey.std()
     network = nn.Sequential(
         nn.Conv2d(1, 16, 3), nn.ReLU(), nn.Conv2d(16, 32, 3, stride=2), nn.ReLU(),
@@ -195,9 +195,9 @@ def area_under_curve(frames: FrameArray, true: FrameArray) -> float:
         nn.functional.binary_cross_entropy_with_logits(scores, labels[batch]).backward()
         optimizer.step()
     with torch.no_grad():
-        found = network(unseen / scale)[:, 0].numpy()
-    order = found.argsort(kind="stable").argsort(kind="stable") + 1
-    positive = told.numpy() > 0.5
+        predictions = network(unseen / scale)[:, 0].numpy()
+    order = predictions.argsort(kind="stable").argsort(kind="stable") + 1
+    positive = truth.numpy() > 0.5
     count = int(positive.sum())
     return float((order[positive].sum() - count * (count + 1) / 2) / (count * (len(order) - count)))
 
@@ -228,7 +228,7 @@ def cost(_: Path) -> Document:
     probe = scene.info.probe_or(None)
     pixel = probe.scan_line_length_mm / SIDE
     sizes = {"as of the phantom": (0.18, 0.36), "as fine as pixels": (0.9 * pixel, 1.5 * pixel)}
-    found = {}
+    by_size = {}
     for name, (axial, lateral) in sizes.items():
         model = SpeckleModel(
             seed=0,
@@ -248,14 +248,14 @@ def cost(_: Path) -> Document:
                 render(scene, None, pose, height=SIDE, width=SIDE, outputs=("bmode",), speckle=one)
                 took[one].append(1e3 * (time.thread_time() - began))
         differences = [on - off for off, on in zip(*took.values(), strict=True)]
-        found[name] = {
+        by_size[name] = {
             "frame_ms": statistics.median(took[Speckle.OFF]),
             "with_ms": statistics.median(took[Speckle.NATURAL]),
             "added_ms": statistics.median(differences),
             "least_frame_ms": min(took[Speckle.OFF]),
             "least_with_ms": min(took[Speckle.NATURAL]),
         }
-    return found
+    return by_size
 
 
 def textures(figures: Document) -> Lines:

@@ -76,9 +76,9 @@ def _structure(cls: Any) -> str:
     declared, read = [], []
     for item, annotation in _fields_of(cls):
         kind, optional = optional_of(annotation)
-        held = _type(kind)
+        type_name = _type(kind)
         default = None if item.default is MISSING else item.default
-        whole = f"std::optional<{held}>" if optional else held
+        whole = f"std::optional<{type_name}>" if optional else type_name
         declared.append(f"    {whole} {item.name}{_default(kind, default, optional)};")
         how = "require" if item.default is MISSING and item.default_factory is MISSING else "read"
         value = _reading(kind, item)
@@ -164,11 +164,11 @@ def _literal(value: Any) -> str:
 
 def _reading(kind: Any, item: Field[Any]) -> str:
     """The expression that takes a field from `value`."""
-    given = item.metadata.get
-    numbers = [(name, given(name)) for name in ("low", "high", "above")]
+    limit_of = item.metadata.get
+    numbers = [(name, limit_of(name)) for name in ("low", "high", "above")]
     limits = ", ".join("{}" if limit is None else repr(float(limit)) for _, limit in numbers)
     limits = "{" + limits + "}" if any(limit is not None for _, limit in numbers) else "{}"
-    most = "{}" if given("most") is None else str(given("most"))
+    most = "{}" if limit_of("most") is None else str(limit_of("most"))
     if get_origin(kind) is tuple:
         element = get_args(kind)[0]
         if Ellipsis not in get_args(kind):

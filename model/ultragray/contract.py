@@ -186,8 +186,8 @@ def made_of(cls: type[_T], *sources: object, **others: Any) -> _T:
     """The dataclass with `others`, and with what sources have under the names of its fields, the first that has one."""
     one: Any = cls
     names = [item.name for item in fields(one) if item.init and item.name not in others]
-    found = {name: getattr(source, name) for name in names for source in sources[::-1] if hasattr(source, name)}
-    return cls(**found, **others)
+    values = {name: getattr(source, name) for name in names for source in sources[::-1] if hasattr(source, name)}
+    return cls(**values, **others)
 
 
 def optional_of(annotation: Any) -> tuple[Any, bool]:
@@ -224,8 +224,8 @@ def to_dict(value: Any, *, with_none: bool = True) -> Any:
     if not is_dataclass(value) or isinstance(value, type):
         return value
     cls: Any = type(value)
-    found = {name: to_dict(getattr(value, name), with_none=with_none) for name in _keys(cls)}
-    return found if with_none else {name: one for name, one in found.items() if one is not None}
+    entries = {name: to_dict(getattr(value, name), with_none=with_none) for name in _keys(cls)}
+    return entries if with_none else {name: one for name, one in entries.items() if one is not None}
 
 
 @cache
@@ -316,35 +316,35 @@ _Check = Callable[[Any], Any]  # the value in its own type; raises InvalidArgume
 @cache
 def _checks(cls: type[Contract]) -> tuple[tuple[str, Any, _Check, type[InvalidArgument]], ...]:
     """Each field's name, its default in its own type, which needs no check, its check, and the error of that."""
-    found = []
+    checks = []
     for item, annotation in annotated_fields(cls):
         kind, optional = optional_of(annotation)
         check = _check_of_kind(kind, item)
         if optional or item.default is None:
             check = partial(_unless_none, check)
         default = MISSING if item.default is MISSING else check(item.default)
-        found.append((item.name, default, check, item.metadata.get("error", cls.error)))
-    return tuple(found)
+        checks.append((item.name, default, check, item.metadata.get("error", cls.error)))
+    return tuple(checks)
 
 
 def _check_of_kind(kind: Any, item: Field[Any]) -> _Check:
-    given = item.metadata.get
+    limit = item.metadata.get
     if get_origin(kind) is Literal:
         return partial(_word, get_args(kind))
     if get_origin(kind) is tuple:
         elements = get_args(kind)
         count = None if Ellipsis in elements else len(elements)
-        return partial(_list, _check_of_kind(elements[0], item), given("most"), count)
+        return partial(_list, _check_of_kind(elements[0], item), limit("most"), count)
     if get_origin(kind) is dict:
-        return partial(_object, given("most"))
+        return partial(_object, limit("most"))
     if not isinstance(kind, type):
         return _any
     if issubclass(kind, Enum):
         return partial(_enum, kind)
     if kind in (int, float):
-        return partial(checked_number, kind=kind, low=given("low"), high=given("high"), above=given("above"))
+        return partial(checked_number, kind=kind, low=limit("low"), high=limit("high"), above=limit("above"))
     if kind is str:
-        return partial(_text, given("choices"))
+        return partial(_text, limit("choices"))
     if kind is bool:
         return partial(_instance, (bool, np.bool_), "true or false")
     return partial(_instance, kind, f"a {kind.__name__}") if issubclass(kind, Contract) else _any
@@ -426,11 +426,11 @@ def range_of(item: Field[Any]) -> str:
 
 def limits_in_words(item: Field[Any]) -> str:
     """The limits of a field, such as "From 0 to 1"; empty where there are none."""
-    given = item.metadata.get
-    words = [_range(given("low"), given("high"), given("above")).strip()]
-    if (choices := given("choices")) is not None:
+    limit = item.metadata.get
+    words = [_range(limit("low"), limit("high"), limit("above")).strip()]
+    if (choices := limit("choices")) is not None:
         words.append(f"one of {', '.join(choices)}")
-    if (most := given("most")) is not None:
+    if (most := limit("most")) is not None:
         words.append(f"at most {most} values")
     joined = ", ".join(word for word in words if word)
     return joined[:1].upper() + joined[1:]
@@ -449,8 +449,8 @@ def _plain(limit: float) -> str:
     return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
-def _refuse(expected: str, given: Any) -> NoReturn:
-    raise InvalidArgument(f"must be {expected}, got {shown(given)}")
+def _refuse(expected: str, value: Any) -> NoReturn:
+    raise InvalidArgument(f"must be {expected}, got {shown(value)}")
 
 
 def shown(value: Any) -> str:

@@ -63,9 +63,9 @@ def remove_stale_temporaries(path: str | Path) -> None:
     """Removes what processes killed inside `atomic_path(path)` left; nobody may be writing `path` meanwhile."""
     path = Path(path)
     prefix = f".{path.name}."
-    for found in path.parent.glob(f"{glob.escape(prefix)}*{TEMPORARY_SUFFIX}"):
-        if "." not in found.name.removeprefix(prefix).removesuffix(TEMPORARY_SUFFIX):  # else another file's
-            found.unlink(missing_ok=True)
+    for file in path.parent.glob(f"{glob.escape(prefix)}*{TEMPORARY_SUFFIX}"):
+        if "." not in file.name.removeprefix(prefix).removesuffix(TEMPORARY_SUFFIX):  # else another file's
+            file.unlink(missing_ok=True)
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
@@ -174,15 +174,15 @@ def _copy(source: Path, target: Path) -> None:
                 raise FileExistsError from None
 
 
-def require_version(found: Any, known: int) -> None:
+def require_version(version: Any, known: int) -> None:
     """Raises ValueError where a file is of another version than the release reads."""
-    if type(found) is int and found > known:
+    if type(version) is int and version > known:
         raise ValueError(
-            f"its format_version is {found}, this release reads {known}: a newer release wrote it, use that one or a "
+            f"its format_version is {version}, this release reads {known}: a newer release wrote it, use that one or a "
             "newer one to read it"
         )
-    if type(found) is not int or found != known:
-        raise ValueError(f"its format_version is {found!r}, this release reads {known}")
+    if type(version) is not int or version != known:
+        raise ValueError(f"its format_version is {version!r}, this release reads {known}")
 
 
 # One array of numbers in a `.npy` file, mapped and not read; what is wrong with a file, in our words.

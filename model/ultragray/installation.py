@@ -119,8 +119,8 @@ def _cpu_info() -> dict[str, str]:
 
 def memory_bytes() -> int:
     """The memory of the machine, or of the container where that may have less."""
-    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for limit in _GROUP_LIMITS:
         with suppress(OSError, ValueError):  # another layout, or "max": no limit
-            found.append(int(limit.read_text(encoding="ascii")))
-    return min(found)
+            limits.append(int(limit.read_text(encoding="ascii")))
+    return min(limits)

@@ -164,7 +164,7 @@ def _compare(
 
         methods = chosen_methods(settings.methods)
         for seed in range(settings.seed, settings.seed + seeds):
-            found = compare_methods(
+            result = compare_methods(
                 dataset,
                 methods,
                 replace(settings, seed=seed),
@@ -173,16 +173,16 @@ def _compare(
                 report=report,
                 should_stop=should_stop,
             )
-            if found is None:
+            if result is None:
                 break
-            comparisons.append(found)
+            comparisons.append(result)
         is_whole = len(comparisons) == seeds
         if is_whole and output is not None:
             from ultragray_studies.comparison.page import write_comparison
 
-            for made in write_comparison(comparisons[0], dataset, run):
-                written.append(output.with_suffix(made.suffix))
-                write_whole(written[-1], made.read_bytes())
+            for file in write_comparison(comparisons[0], dataset, run):
+                written.append(output.with_suffix(file.suffix))
+                write_whole(written[-1], file.read_bytes())
             if seeds > 1:
                 write_whole(output.with_suffix(".json"), to_json(seeds_document(comparisons)) + "\n")
                 written.append(output.with_suffix(".svg"))

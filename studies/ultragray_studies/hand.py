@@ -116,8 +116,8 @@ class HandSweep:
             wander = hand.at(_smooth_noise(random, len(hand.seconds), 1.0), times_s)
             noise = random.normal(size=(self.count, 6))
             sizes = [(errors.noise_mm, errors.noise_deg), (errors.wander_mm, errors.wander_deg)]
-            found = sum(part * ([mm] * 3 + [deg] * 3) for part, (mm, deg) in zip((noise, wander), sizes, strict=True))
-            passes.append(_moved(hand.poses(times_s), np.asarray(found)))
+            offsets = sum(part * ([mm] * 3 + [deg] * 3) for part, (mm, deg) in zip((noise, wander), sizes, strict=True))
+            passes.append(_moved(hand.poses(times_s), np.asarray(offsets)))
         off = np.array([1.0, -1.0, 1.0]) / np.sqrt(3.0)
         calibration = np.concatenate([errors.calibration_mm * off, errors.calibration_deg * off[[1, 0, 2]]])
         return _moved(np.concatenate(passes), calibration[None])

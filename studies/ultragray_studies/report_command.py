@@ -119,10 +119,10 @@ def _write_report(
             trained = study.train_and_evaluate(dataset, config, report=partial(follow, SCENE))
             scene, course = trained.scene, trained.course
         ablated = study.ablation_methods(config, scene.gaussian_count) if ablations else {}
-        given = GivenScene(scene, 0.0 if course is None else course.seconds)
+        method = GivenScene(scene, 0.0 if course is None else course.seconds)
         comparison = compare_methods(
             dataset,
-            {SCENE: given, **study.baselines(voxel_mm), **ablated},
+            {SCENE: method, **study.baselines(voxel_mm), **ablated},
             ComparisonSettings(seed=config.seed),
             folder=folder,
             report=lambda state: None if state.fit is None else follow(state.method, state.fit),

@@ -42,9 +42,9 @@ class PathReport:
         middle, crossing = np.append(probe.corners_mm().mean(axis=0), 1.0), path.crossing
         shift_mm = float(np.linalg.norm(path.calibration @ middle - middle))
         turn_deg = float(np.degrees(turn_angles_rad(path.calibration[:3, :3], np.eye(3))))
-        told = dict(_told(path, shift_mm, turn_deg))
+        texts = dict(_causes(path, shift_mm, turn_deg))
         return cls(
-            causes=tuple(told),
+            causes=tuple(texts),
             in_time_db=path.in_time_db,
             tracked_db=path.tracked_db,
             found_db=path.found_db,
@@ -58,7 +58,7 @@ class PathReport:
             crossing_before=None if crossing is None else crossing.before,
             crossing_after=None if crossing is None else crossing.after,
             crossing_mm=None if crossing is None else crossing.shift_mm,
-            warnings=(*_predicted(path, bool(told)), *told.values()),
+            warnings=(*_predicted(path, bool(texts)), *texts.values()),
         )
 
 
@@ -71,7 +71,7 @@ def _predicted(path: AgreedPath, has_causes: bool) -> Iterator[str]:
         yield f"the two neighbours in time predict a frame {better_db:.1f} dB better than by their poses; {found}"
 
 
-def _told(path: AgreedPath, calibration_mm: float, calibration_deg: float) -> Iterator[tuple[str, str]]:
+def _causes(path: AgreedPath, calibration_mm: float, calibration_deg: float) -> Iterator[tuple[str, str]]:
     """The causes, and each in a sentence."""
     if path.is_smoothed:
         lateral_mm, elevation_mm, axial_mm = path.noise.axes_mm

@@ -470,7 +470,7 @@ def _read_frames(
         syntax = header.file_meta.TransferSyntaxUID
     if syntax in JPEG and bits == 8 and interpretation != "PALETTE COLOR":
         return _read_jpeg(path, header, shape, chosen)
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     with _in_our_words(path):
         from pydicom.pixels import apply_color_lut, convert_color_space, get_decoder, iter_pixels
 
@@ -511,16 +511,16 @@ def _read_frames(
                 as_ybr = convert_color_space(frame, "YBR_FULL", "RGB")
                 if _is_otherwise(*((as_ybr, frame) if is_ybr else (frame, as_ybr))):
                     is_ybr = not is_ybr
-                    said = (_other_colours(interpretation, "YBR_FULL" if is_ybr else "RGB"),)
+                    notes = (_other_colours(interpretation, "YBR_FULL" if is_ybr else "RGB"),)
             frame = convert_color_space(frame, "YBR_FULL", "RGB") if is_ybr else frame
             out[:] = grey_frames(frame[None], str(path))[0]
     if is_wide and (used := int(frames.max()).bit_length()) <= bits - UNUSED_BITS:
-        said, surplus = (f"only {used} of the {bits} bits of its pixels are used",), max(0, used - 8)
+        notes, surplus = (f"only {used} of the {bits} bits of its pixels are used",), max(0, used - 8)
     if surplus:
         what, bits = ("colours", 8 + surplus) if interpretation == "PALETTE COLOR" else ("pixels", bits)
-        said = (*said, f"{what} of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
+        notes = (*notes, f"{what} of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
     grey = (frames >> surplus).astype(np.uint8) if is_wide else frames
-    return 255 - grey if interpretation == "MONOCHROME1" else grey, said
+    return 255 - grey if interpretation == "MONOCHROME1" else grey, notes
 
 
 def _shared_colours(path: Path, shape: tuple[int, int, int], chosen: IntArray) -> Iterator[ByteArray]:
@@ -548,12 +548,12 @@ def _shared_colours(path: Path, shape: tuple[int, int, int], chosen: IntArray) -
 
 def _is_otherwise(as_said: ByteArray, as_other: ByteArray) -> bool:  # [rows, columns, 3]
     """Whether an image is grey, as ultrasound mostly is, where it is read otherwise than its header says."""
-    said, other = (float((np.ptp(one, axis=2) <= GREY_LEVELS).mean()) for one in (as_said, as_other))
-    return other > LEAST_GREY and said < other / 2
+    own, other = (float((np.ptp(one, axis=2) <= GREY_LEVELS).mean()) for one in (as_said, as_other))
+    return other > LEAST_GREY and own < other / 2
 
 
-def _other_colours(said: str, found: str) -> str:
-    return f"the header says {said}, the pixels are {found}: read as they are"
+def _other_colours(header: str, pixels: str) -> str:
+    return f"the header says {header}, the pixels are {pixels}: read as they are"
 
 
 def _read_jpeg(
@@ -607,16 +607,16 @@ def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, 
     sizes = set() if frame_header is None else set(frame_header.group(2, 4, 6))
     adobe = re.search(rb"\xff\xee..Adobe.{6}(.)", begin, re.DOTALL)
     is_rgb = names in (b"RGB", b"rgb") if adobe is None else adobe[1] == b"\0"
-    is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
-    if not is_told and len(sizes) == 1:
+    is_declared = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
+    if not is_declared and len(sizes) == 1:
         is_rgb = interpretation in RGB
         ways = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
         as_ybr, as_rgb = (None if one is None else np.asarray(one, np.uint8) for one in ways)
         if as_ybr is not None and as_rgb is not None:
             is_rgb ^= _is_otherwise(*((as_rgb, as_ybr) if is_rgb else (as_ybr, as_rgb)))
-    is_other = not is_told and is_rgb != (interpretation in RGB)
+    is_other = not is_declared and is_rgb != (interpretation in RGB)
     notes = (_other_colours(interpretation, "RGB" if is_rgb else "YBR_FULL"),) if is_other else ()
-    return is_rgb and not is_told, notes
+    return is_rgb and not is_declared, notes
 
 
 def _as_rgb(stream: bytes) -> bytes:

@@ -106,7 +106,7 @@ class TrackedPoses:
         self._frames: dict[str, Counter[str]] = {}  # that the poses of a topic are in
         self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
         self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
-        self._told_by: dict[TransformName, set[str]] = {}  # the topics of tf that tell a moving one
+        self._topics_of: dict[TransformName, set[str]] = {}  # the topics of tf that tell a moving one
         self._fixed: dict[TransformName, list[_Stamped]] = {}
 
     @property
@@ -131,7 +131,7 @@ class TrackedPoses:
             for transform in message.decode().transforms:
                 kept.setdefault(_name_of(transform), []).append(_stamped(transform, message))
                 if not is_static:
-                    self._told_by.setdefault(_name_of(transform), set()).add(message.topic)
+                    self._topics_of.setdefault(_name_of(transform), set()).add(message.topic)
 
     def way(self, topic: str, frame: str, transform: str | None) -> Way:
         """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
@@ -188,7 +188,7 @@ class TrackedPoses:
         notes: list[str] = []
         for name, is_inverted in way:
             called, is_tracked = "To".join(name), name in self._transforms
-            if len(topics := self._told_by.get(name, set())) > 1:
+            if len(topics := self._topics_of.get(name, set())) > 1:
                 raise DatasetInvalid(
                     f"{self._path}: {called} is told on {' and on '.join(sorted(topics))}: record the tf of one robot, "
                     "or give their frames names of their own"
@@ -375,16 +375,16 @@ class _Contents:
         among them."""
         if (given := geometry_beside(self._path)) is not None:
             return given, f"{self._path.stem}{BESIDE}"
-        near = [told for name, told in self._geometries.items() if topic.startswith(name.removesuffix(GEOMETRY[1:]))]
+        near = [one for name, one in self._geometries.items() if topic.startswith(name.removesuffix(GEOMETRY[1:]))]
         if len(near) != 1:
             raise DatasetInvalid(
                 f"{self._path}: it does not say which probe its images are of, on a topic beside {topic} that ends in "
                 f"{GEOMETRY}: say it in {self._path.stem}{BESIDE} beside the file, such as "
                 '{"probe": {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50}}'
             )
-        told = sorted(near[0])
-        times = [time_ns for time_ns, _ in told]
-        texts = [told[max(0, bisect_right(times, int(time_ns)) - 1)][1] for time_ns in log_times_ns]
+        entries = sorted(near[0])
+        times = [time_ns for time_ns, _ in entries]
+        texts = [entries[max(0, bisect_right(times, int(time_ns)) - 1)][1] for time_ns in log_times_ns]
         known = {text: read_geometry(text, str(self._path)) for text in dict.fromkeys(texts)}
         for number, text in zip(numbers, texts, strict=True):
             if known[text] != known[texts[0]]:
@@ -397,14 +397,14 @@ class _Contents:
         return known[texts[0]], near_topic
 
 
-def _chosen(path: Path, option: str, asked: str | None, topics: list[str], preferred: str, contents: _Contents) -> str:
+def _chosen(path: Path, option: str, choice: str | None, topics: list[str], preferred: str, contents: _Contents) -> str:
     """The topic that was asked for; else the only one, or the only one that ends as the node's do."""
     noun = option.removesuffix("_topic") + "s"
     listed = ", ".join(topics) or ", ".join(f"{topic} ({kind})" for topic, kind in sorted(contents.kinds.items()))
-    if asked is not None:
-        if asked not in topics:
-            raise InvalidArgument(f"{option} must be one of {listed or 'no topics'}, got {asked[:80]!r}", field=option)
-        return asked
+    if choice is not None:
+        if choice not in topics:
+            raise InvalidArgument(f"{option} must be one of {listed or 'no topics'}, got {choice[:80]!r}", field=option)
+        return choice
     found = topics if len(topics) == 1 else [topic for topic in topics if topic.endswith(preferred)]
     if len(found) != 1:
         needed = f"choose one with {option}" if topics else f"a sweep needs a topic of {noun}"

@@ -504,8 +504,8 @@ def _notes(
         for number in numbers.tolist():
             depths.setdefault(stored.frame_fields[number].get(key, "unknown"), []).append(number)
         if len(depths) > 1:
-            said = "; ".join(f"{depth} in {frame_list(places)}" for depth, places in list(depths.items())[:5])
+            listing = "; ".join(f"{depth} in {frame_list(places)}" for depth, places in list(depths.items())[:5])
             raise DatasetInvalid(
-                f"{stored.path}: {key} changes on the way: {said}; choose frames of one depth with frames"
+                f"{stored.path}: {key} changes on the way: {listing}; choose frames of one depth with frames"
             )
     return notes

@@ -32,21 +32,21 @@ _RANGE = re.compile(r"(?P<before>[^{}]*)\{(?P<first>\d{1,9})\.\.(?P<last>\d{1,9}
 
 def names_in(name: str) -> Iterator[str]:
     """All names that a name stands for: those of its range, or itself."""
-    found = _RANGE.fullmatch(name)
-    if found is None:
+    match = _RANGE.fullmatch(name)
+    if match is None:
         yield name
         return
-    before, first, last, after = found.groups()
+    before, first, last, after = match.groups()
     for number in range(int(first), int(last) + 1):
         yield f"{before}{number:0{len(first)}d}{after}"
 
 
 def stands_for(name: str, one: str) -> bool:
     """Whether `one` is among the names that `name` stands for; none of them is written out."""
-    found = _RANGE.fullmatch(name)
-    if found is None:
+    match = _RANGE.fullmatch(name)
+    if match is None:
         return name == one
-    before, first, last, after = found.groups()
+    before, first, last, after = match.groups()
     number = one.removeprefix(before).removesuffix(after)
     is_number = number.isascii() and number.isdecimal() and one == f"{before}{int(number):0{len(first)}d}{after}"
     return is_number and int(first) <= int(number) <= int(last)

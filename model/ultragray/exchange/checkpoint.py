@@ -65,12 +65,12 @@ def import_checkpoint(
     `weights_only=True`: it never runs code.
     """
     placements = {"poses": poses is not None, "center_mm": center_mm is not None, "centered": centered}
-    given = [name for name, used in placements.items() if used]
-    if len(given) != 1:
+    names = [name for name, used in placements.items() if used]
+    if len(names) != 1:
         raise InvalidArgument(
             "exactly one of poses (the training poses, from which the scene centre follows), center_mm (the "
             "centre in mm) and centered (poses relative to the centre) must be given, got "
-            f"{' and '.join(given) or 'none'}",
+            f"{' and '.join(names) or 'none'}",
             field="poses",
         )
     released = read_released_config(config)
@@ -184,8 +184,8 @@ def _why_unreadable(error: Exception) -> str:
     text = str(error)
     if isinstance(error, pickle.UnpicklingError) and "eights only load failed" in text:
         name = re.search(r"(?:GLOBAL|global) ([A-Za-z_]\w*\.[\w.]+)", text)
-        found = f" ({name.group(1).rstrip('.')})" if name else ""
-        return f"refused, as it holds more than tensors and plain values and could run code{found}"
+        detail = f" ({name.group(1).rstrip('.')})" if name else ""
+        return f"refused, as it holds more than tensors and plain values and could run code{detail}"
     if isinstance(error, RuntimeError):
         return f"truncated, or not a PyTorch checkpoint: {text.split('. ')[0].splitlines()[0][:200]}"
     return "truncated, or not a PyTorch checkpoint"
@@ -262,8 +262,8 @@ def fit_released_intensity(scene: GaussianScene) -> ReleasedIntensity:
         target = torch.einsum("nmk,nm->nk", weighted, wanted.clamp(LOWEST, HIGHEST) - 1.0)
         fitted[ids] = torch.linalg.solve(normal, target)
         compared = seen if len(origins) else everywhere
-        shown = (torch.einsum("nmk,nk->nm", compared, fitted[ids]) + 1.0).clamp(LOWEST, HIGHEST)
-        errors = (shown - wanted[:, : compared.shape[1]]).abs()
+        values = (torch.einsum("nmk,nk->nm", compared, fitted[ids]) + 1.0).clamp(LOWEST, HIGHEST)
+        errors = (values - wanted[:, : compared.shape[1]]).abs()
         largest = max(largest, float(errors.max()))
         total, terms = total + float(errors.sum()), terms + errors.numel()
     parameters = fitted.to(scene.sh0.dtype)[..., None]

@@ -40,18 +40,18 @@ def write_page(scene: Path, folder: Path) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InvalidArgument(f"{folder} must be a new folder, or an empty one", field="page")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        made.chmod(0o755)
-        shutil.copytree(ASSETS, made, dirs_exist_ok=True, copy_function=shutil.copyfile)
-        _write_compressed(header, scene, made / "scene.ugz")
-        (made / "page.json").write_text(json.dumps(_described(header, scene.stem)), encoding="utf-8")
-        for path in made.rglob("*"):
+        temporary.chmod(0o755)
+        shutil.copytree(ASSETS, temporary, dirs_exist_ok=True, copy_function=shutil.copyfile)
+        _write_compressed(header, scene, temporary / "scene.ugz")
+        (temporary / "page.json").write_text(json.dumps(_described(header, scene.stem)), encoding="utf-8")
+        for path in temporary.rglob("*"):
             sync(path)
-        os.replace(made, folder)
+        os.replace(temporary, folder)
         sync(folder.parent)
     except BaseException:
-        shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
     return sorted(path for path in folder.rglob("*") if path.is_file())
 

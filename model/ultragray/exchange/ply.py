@@ -116,7 +116,7 @@ def read_ply(path: str | Path) -> GaussianScene:
 def _read_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, np.dtype[np.void]]]]:
     """The metadata, and of each element its number of records and their type. Raises ValueError."""
     metadata, layout = "", "format missing"
-    found: dict[str, tuple[int, list[tuple[str, str]]]] = {}
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     for line in lines:
         match line.split():
             case ["comment", "ultragray", *pieces]:
@@ -126,34 +126,34 @@ def _read_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, np.dtype[n
             case ["format", *_]:
                 layout = " ".join(line.split())
             case ["element", "vertex" | "training_pose" as name, count] if re.fullmatch(r"\d{1,15}", count):
-                found[name] = (int(count), [])
+                elements[name] = (int(count), [])
             case ["element", name, _] if name not in ("vertex", "training_pose"):
                 raise ValueError(f"it has an element {name[:40]!r}, expected vertex and training_pose")
-            case ["property", kind, name] if found and kind in _DTYPES:
-                found[list(found)[-1]][1].append((name, _DTYPES[kind]))
+            case ["property", kind, name] if elements and kind in _DTYPES:
+                elements[list(elements)[-1]][1].append((name, _DTYPES[kind]))
             case _:
                 raise ValueError(f"its header has a line that it cannot have: {line[:80]!r}")
     if layout != LAYOUT:
         raise ValueError(f"its {layout.replace('format', 'format is')[:80]}, expected {LAYOUT.removeprefix('format ')}")
     if not metadata:
         raise ValueError("it has no comments `ultragray …` that say what it is a scene of")
-    if "vertex" not in found:
-        raise ValueError(f"its elements are {list(found)}, expected vertex and training_pose")
-    return metadata, {name: (count, _record(name, columns)) for name, (count, columns) in found.items()}
+    if "vertex" not in elements:
+        raise ValueError(f"its elements are {list(elements)}, expected vertex and training_pose")
+    return metadata, {name: (count, _record(name, columns)) for name, (count, columns) in elements.items()}
 
 
 def _record(name: str, columns: list[tuple[str, str]]) -> np.dtype[np.void]:
     """The type of an element's records, whose properties are those of a scene in any order. Raises ValueError."""
-    given = dict(columns)
-    rest = sum(column.startswith("f_rest_") for column in given)
+    kinds = dict(columns)
+    rest = sum(column.startswith("f_rest_") for column in kinds)
     degree = next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == rest), 0)
-    kind_of = _vertex(degree, LABEL in given) if name == "vertex" else _POSE
+    kind_of = _vertex(degree, LABEL in kinds) if name == "vertex" else _POSE
     wanted = {column: kind for column, kind, *_ in kind_of.descr}
-    if missing := sorted(wanted.keys() - given.keys()):
+    if missing := sorted(wanted.keys() - kinds.keys()):
         raise ValueError(f"its {name} lacks {', '.join(missing)}")
-    if surplus := sorted(given.keys() - wanted.keys()):
+    if surplus := sorted(kinds.keys() - wanted.keys()):
         raise ValueError(f"its {name} has {', '.join(surplus)[:80]}, which no scene has")
-    if len(given) != len(columns):
+    if len(kinds) != len(columns):
         raise ValueError(f"its {name} has a property twice")
     for column, kind in columns:
         if kind != wanted[column]:
@@ -165,8 +165,8 @@ def _scene(metadata: str, vertices: Records, poses: Records | None) -> GaussianS
     rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
 
     def columns(*chosen: str) -> Any:  # [N, len(chosen)]
-        found = np.array([vertices[name] for name in chosen], np.float32)
-        return torch.from_numpy(found.reshape(len(chosen), len(vertices)).T.copy())
+        values = np.array([vertices[name] for name in chosen], np.float32)
+        return torch.from_numpy(values.reshape(len(chosen), len(vertices)).T.copy())
 
     splats = {
         "means": columns("x", "y", "z"),

@@ -64,8 +64,8 @@ def read_frame_poses(path: str | Path) -> npt.NDArray[Any]:
 
 def frames_with_pose(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [F, 4, 4] -> [F]
     """Whether each frame has a pose: one of NaN alone is none."""
-    found: npt.NDArray[np.bool_] = ~np.isnan(poses[:, :3]).all(axis=(1, 2))
-    return found
+    has_pose: npt.NDArray[np.bool_] = ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+    return has_pose
 
 
 def _read(path: Path) -> Any:
@@ -119,7 +119,7 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
         try:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
             topic = _topic(reader.get_summary())
-            messages = [found.decoded_message for found in reader.iter_decoded_messages(topics=[topic])]
+            messages = [record.decoded_message for record in reader.iter_decoded_messages(topics=[topic])]
         except (OSError, ValueError):
             raise
         except Exception as error:  # the library has many kinds for a file that is not whole

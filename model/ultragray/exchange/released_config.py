@@ -204,8 +204,8 @@ def _count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) 
 def _find_images(path: Path, named: str | None, within: Path | None) -> tuple[TrainingImages | None, str]:
     if named is None:
         return None, f"{path} names no images_file_train"
-    found = _find(path, named, within)
-    return (None, f"the file {named[:200]!r} that {path} names was not found") if found is None else (_shape(found), "")
+    file = _find(path, named, within)
+    return (None, f"the file {named[:200]!r} that {path} names was not found") if file is None else (_shape(file), "")
 
 
 def _find(path: Path, named: str, within: Path | None) -> Path | None:

@@ -44,16 +44,18 @@ def assess_by_rendering(
     portion = frames_at_once(settings.height, settings.width)
 
     def assess_frames(poses: FloatArray) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
-        found = list(assess(poses))
-        able = [place for place, one in enumerate(found) if is_confident(one, least)]
+        extrapolations = list(assess(poses))
+        able = [place for place, one in enumerate(extrapolations) if is_confident(one, least)]
         for first in range(0, len(able), portion):
             places = able[first : first + portion]
             with torch.no_grad():
                 coverage = recorded_coverage(scene, settings, poses[places], backend=backend, limits=limits)
             shares = supported_shares(coverage).tolist()
-            for place, one in zip(places, assessor.with_support([found[i] for i in places], shares), strict=True):
-                found[place] = one
-        return found
+            for place, one in zip(
+                places, assessor.with_support([extrapolations[i] for i in places], shares), strict=True
+            ):
+                extrapolations[place] = one
+        return extrapolations
 
     return assess_frames
 
@@ -97,7 +99,7 @@ def render_to_file(
         scene_sha256=scene_sha256,
         renderer=renderer_name(backend, scene),
     )
-    found: list[Extrapolation] = []
+    results: list[Extrapolation] = []
     exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
     portions = render_portions(
         scene,
@@ -112,8 +114,8 @@ def render_to_file(
     with exporting as writing, written_behind(writing) as write:
         for frames, figures in portions:
             write(frames, figures)
-            found.extend(figures)
-    return RenderedFile(found, writing.sha256)
+            results.extend(figures)
+    return RenderedFile(results, writing.sha256)
 
 
 def render_portions(
@@ -144,12 +146,12 @@ def render_portions(
         some = poses[first : first + portion]
         with torch.no_grad():
             after = limits.after(first)
-            shown = render_shown(
+            images = render_shown(
                 scene, settings, some, backend=backend, limits=after, support=support, in_bytes=in_bytes
             )
         figures = support.completed(first, first + len(some))
         require_confidence(figures, settings.least_confidence, first=first)
-        yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
+        yield {name: pixels.cpu().numpy() for name, pixels in images.items()}, figures
     if before_portion is not None:
         before_portion(len(poses))
 

@@ -55,14 +55,14 @@ def _first_other(value: Any, wanted: Any) -> str | None:
     """Where a value is other than wanted: the path of a field, empty for the value itself."""
     if isinstance(wanted, dict):
         for name, kind in wanted.items():
-            found = _first_other(getattr(value, name, None), kind)
-            if found is not None:
-                return f"{name}.{found}" if found else name
+            path = _first_other(getattr(value, name, None), kind)
+            if path is not None:
+                return f"{name}.{path}" if path else name
         return None
     if isinstance(wanted, list):
         if not isinstance(value, list):
             return ""
-        return next((found for one in value if (found := _first_other(one, wanted[0])) is not None), None)
+        return next((path for one in value if (path := _first_other(one, wanted[0])) is not None), None)
     is_as_wanted = type(value) is int and value in wanted if isinstance(wanted, range) else isinstance(value, wanted)
     return None if is_as_wanted else ""
 

@@ -179,12 +179,12 @@ class ShardRenderer:
     def _assess(self, look_up: Callable[[int], object], poses: FloatArray) -> list[Extrapolation]:
         """How far poses extrapolate, some at a time, so that a stop comes soon."""
         at_once = max(1, ASSESSED_AT_ONCE // max(1, len(self._header.training_poses)))
-        found: list[Extrapolation] = []
+        extrapolations: list[Extrapolation] = []
         for first in range(0, len(poses), at_once):
             look_up(0)
             some, settings = poses[first : first + at_once], self._settings
-            found.extend(self._assessor.assess(some, probe=settings.probe, phase=settings.phase))
-        return found
+            extrapolations.extend(self._assessor.assess(some, probe=settings.probe, phase=settings.phase))
+        return extrapolations
 
 
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second

@@ -34,7 +34,7 @@ SMALLEST_DRIFT_MM, CLEAR_DRIFT = 2.0, 5.0  # the second in standard errors of th
 FLOOR_MM = 1e-3  # residuals below it are alike
 UNITS = {1000.0: "metres", 10.0: "centimetres"}
 
-_Given = dict[str, FloatArray]
+_Series = dict[str, FloatArray]
 _Score = tuple[float, float]  # what is left, and how far off the flange the probe would be: of two as good, the nearer
 
 
@@ -42,33 +42,33 @@ def pose_contradiction(
     fit: PoseFit, flange_to_base: Any, probe_to_scene: Any, *, is_mounting_given: bool
 ) -> str | None:
     """The worst sample and the likely cause, in words; None where the poses agree."""
-    given = {"flange": check_poses(flange_to_base), "probe": check_poses(probe_to_scene)}
+    series = {"flange": check_poses(flange_to_base), "probe": check_poses(probe_to_scene)}
     if is_mounting_given:
-        given["probe_to_flange"] = fit.probe_to_flange[None]
+        series["probe_to_flange"] = fit.probe_to_flange[None]
 
-    def fitted(given: _Given) -> PoseFit:
-        poses = given["flange"], given["probe"]
+    def fitted(series: _Series) -> PoseFit:
+        poses = series["flange"], series["probe"]
         return (
-            register_poses(*poses, given["probe_to_flange"][0])
+            register_poses(*poses, series["probe_to_flange"][0])
             if is_mounting_given
             else register_poses_and_mounting(*poses)
         )
 
-    def score(given: _Given) -> _Score:
-        found = fitted(given)
-        mounted_mm = float(np.linalg.norm(found.probe_to_flange[:3, 3]))
-        return _root_mean_square(found.residuals_mm, found.residuals_deg), mounted_mm
+    def score(series: _Series) -> _Score:
+        new_fit = fitted(series)
+        mounted_mm = float(np.linalg.norm(new_fit.probe_to_flange[:3, 3]))
+        return _root_mean_square(new_fit.residuals_mm, new_fit.residuals_deg), mounted_mm
 
-    drift = _drift(given, fitted) if len(given["probe"]) >= LEAST_TO_DRIFT else None
-    return _explained(given, fit.residuals_mm, fit.residuals_deg, score, drift)
+    drift = _drift(series, fitted) if len(series["probe"]) >= LEAST_TO_DRIFT else None
+    return _explained(series, fit.residuals_mm, fit.residuals_deg, score, drift)
 
 
 def point_contradiction(fit: PointFit, in_base: Any, in_scene: Any) -> str | None:
     """As `pose_contradiction`, of points [N, 3]."""
-    given = {"base": np.asarray(in_base, np.float64), "scene": np.asarray(in_scene, np.float64)}
+    series = {"base": np.asarray(in_base, np.float64), "scene": np.asarray(in_scene, np.float64)}
     nothing = np.zeros_like(fit.residuals_mm)
     return _explained(
-        given, fit.residuals_mm, nothing, lambda given: (register_points(given["base"], given["scene"]).rms_mm, 0.0)
+        series, fit.residuals_mm, nothing, lambda series: (register_points(series["base"], series["scene"]).rms_mm, 0.0)
     )
 
 
@@ -76,50 +76,50 @@ def _root_mean_square(mm: FloatArray, deg: FloatArray) -> float:
     return float(np.sqrt(np.mean(mm**2 + (LEVER_MM * np.radians(deg)) ** 2)))
 
 
-def _drift(given: _Given, fitted: Callable[[_Given], PoseFit]) -> tuple[str, float] | None:
+def _drift(series: _Series, fitted: Callable[[_Series], PoseFit]) -> tuple[str, float] | None:
     """A probe that is measured further off with every sample, evenly, in words, and the residuals without it in mm.
 
     The slope of the residuals over the samples is taken off the positions, and the poses are fitted again, until no
     slope is left: a fit takes a part of the drift for its own. None where the slope is not far beyond its own standard
     error.
     """
-    since, drift_mm, off = np.linspace(-0.5, 0.5, len(given["probe"])), np.zeros(3), np.zeros((0, 3))
+    since, drift_mm, off = np.linspace(-0.5, 0.5, len(series["probe"])), np.zeros(3), np.zeros((0, 3))
     for _ in range(DRIFT_FITS):
-        probes = given["probe"].copy()
+        probes = series["probe"].copy()
         probes[:, :3, 3] -= since[:, None] * drift_mm
         try:
-            fit = fitted({**given, "probe": probes})
+            fit = fitted({**series, "probe": probes})
         except UltragrayError:
             return None
-        off = probes[:, :3, 3] - (fit.base_to_scene @ given["flange"] @ fit.probe_to_flange)[:, :3, 3]
+        off = probes[:, :3, 3] - (fit.base_to_scene @ series["flange"] @ fit.probe_to_flange)[:, :3, 3]
         drift_mm = drift_mm + since @ off / (since @ since)
-    far_mm, left_mm = float(np.linalg.norm(drift_mm)), float(np.sqrt(np.square(off).sum(axis=1).mean()))
-    if far_mm < max(SMALLEST_DRIFT_MM, CLEAR_DRIFT * left_mm / float(np.sqrt(since @ since))):
+    far_mm, residual_mm = float(np.linalg.norm(drift_mm)), float(np.sqrt(np.square(off).sum(axis=1).mean()))
+    if far_mm < max(SMALLEST_DRIFT_MM, CLEAR_DRIFT * residual_mm / float(np.sqrt(since @ since))):
         return None
-    return f"the probe slipped or a tracker drifts, by {far_mm:.2g} mm from the first sample to the last", left_mm
+    return f"the probe slipped or a tracker drifts, by {far_mm:.2g} mm from the first sample to the last", residual_mm
 
 
 def _explained(
-    given: _Given,
+    series: _Series,
     mm: FloatArray,
     deg: FloatArray,
-    score: Callable[[_Given], _Score],
+    score: Callable[[_Series], _Score],
     drift: tuple[str, float] | None = None,
 ) -> str | None:
-    spans_mm = [float(np.ptp(_positions(samples), axis=0).max()) for samples in list(given.values())[:2]]
+    spans_mm = [float(np.ptp(_positions(samples), axis=0).max()) for samples in list(series.values())[:2]]
     if max(spans_mm) < SMALLEST_SPAN_MM:
         return f"all samples lie within {max(spans_mm):.2g} mm: are their positions in metres?"
     if mm.max() < SMALLEST_MM and deg.max() < SMALLEST_DEG:
         return None
     weights = mm**2 + (LEVER_MM * np.radians(deg)) ** 2
     best, cause = (CURED * _root_mean_square(mm, deg), 0.0), ""
-    for text, changes in _mistakes(given, np.argsort(-weights)):
+    for text, changes in _mistakes(series, np.argsort(-weights)):
         try:
-            left, mounted_mm = score({**given, **changes})
+            residual_mm, mounted_mm = score({**series, **changes})
         except UltragrayError:  # what is left cannot be fitted
             continue
-        if (max(FLOOR_MM, left), mounted_mm) < best:
-            best, cause = (max(FLOOR_MM, left), mounted_mm), text
+        if (max(FLOOR_MM, residual_mm), mounted_mm) < best:
+            best, cause = (max(FLOOR_MM, residual_mm), mounted_mm), text
     if not cause and drift is not None:
         cause, best = drift[0], (drift[1], 0.0)
     if not cause and mm.max() <= LARGEST_MM and deg.max() <= LARGEST_DEG:
@@ -133,16 +133,16 @@ def _explained(
     )
 
 
-def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Mapping[str, FloatArray]]]:
+def _mistakes(series: _Series, worst_first: np.ndarray) -> Iterator[tuple[str, Mapping[str, FloatArray]]]:
     """Each likely mistake of single samples, of units and of directions."""
-    (one_name, one), (other_name, other), *mounting = given.items()
+    (one_name, one), (other_name, other), *mounting = series.items()
     both = (one_name, other_name)
-    for names in (*((name,) for name in given), both):
+    for names in (*((name,) for name in series), both):
         what = " and ".join(names)
         for factor, unit in UNITS.items():
-            yield f"the positions of {what} are in {unit}", {name: _scaled(given[name], factor) for name in names}
+            yield f"the positions of {what} are in {unit}", {name: _scaled(series[name], factor) for name in names}
         if one.ndim == 3 and (mounting or names != both):  # with a mounting to be found, both agree all the same
-            yield f"the poses of {what} are inverted", {name: _inverted(given[name]) for name in names}
+            yield f"the poses of {what} are inverted", {name: _inverted(series[name]) for name in names}
     if len(one) > LEAST_TO_LEAVE_ONE_OUT:
         yield f"{one_name} is one sample late", {one_name: one[1:], other_name: other[:-1]}
         yield f"{one_name} is one sample early", {one_name: one[:-1], other_name: other[1:]}

@@ -123,15 +123,15 @@ class PathPredictor:
         self._attempts.append(_Attempt(self._times_s[-1] + ahead_s, self._places[-1], motions))
         shares = np.clip(self._agreed / (self._foretold * (1.0 + _DOUBT / max(self._count, _TINY)) + _TINY), 0.0, 1.0)
         shares[len(self._times_s) <= self._degrees] = 0.0  # of a path that has just begun anew
-        left = self._moved - 2.0 * shares * self._agreed + shares**2 * self._foretold  # [K, 2]
-        best, parts = left.argmin(axis=0), np.arange(2)
+        squares = self._moved - 2.0 * shares * self._agreed + shares**2 * self._foretold  # [K, 2]
+        best, parts = squares.argmin(axis=0), np.arange(2)
         shift, turn = shortened(shares[best, parts, None] * motions[best, parts], _MOST)
         pose = self._pose.copy()
         pose[:3, 3] += shift
         pose[:3, :3] @= rotations_of(turn[None])[0]
         if not self._count:
             return pose, Prediction(round(1e3 * ahead_s, 3), None, None)
-        position, rotation = np.sqrt(np.maximum(left.min(axis=0), 0.0) / self._count)
+        position, rotation = np.sqrt(np.maximum(squares.min(axis=0), 0.0) / self._count)
         return pose, Prediction(
             round(1e3 * ahead_s, 3), round(float(position), 3), round(float(np.degrees(rotation)), 3)
         )

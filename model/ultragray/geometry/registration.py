@@ -51,8 +51,8 @@ def register_points(points: Any, targets: Any) -> PointFit:  # [N, 3] mm both
     points, targets = _checked(points, "points"), _checked(targets, "targets")
     if len(points) != len(targets):
         raise InvalidArgument(f"each point needs its target: got {len(points)} and {len(targets)}", field="targets")
-    for field, given in (("points", points), ("targets", targets)):
-        extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+    for field, positions in (("points", points), ("targets", targets)):
+        extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
         if extents[1] <= LEAST_SPREAD * extents[0] or extents[0] == 0.0:
             raise InvalidArgument(
                 f"{field} lie on a line, or in one place: a turn about it stays unknown; add one beside it", field=field
@@ -61,9 +61,9 @@ def register_points(points: Any, targets: Any) -> PointFit:  # [N, 3] mm both
     rotation = _rotation(points - middle, targets - target_middle)
     transform = transforms_of(rotation, target_middle - rotation @ middle)
     centred = (points - middle) @ rotation.T
-    left = centred - (targets - target_middle)
-    position_std_mm, angle_std_deg = _deviations(centred, left)
-    return PointFit(transform, np.linalg.norm(left, axis=1), position_std_mm, angle_std_deg)
+    residuals = centred - (targets - target_middle)
+    position_std_mm, angle_std_deg = _deviations(centred, residuals)
+    return PointFit(transform, np.linalg.norm(residuals, axis=1), position_std_mm, angle_std_deg)
 
 
 def _rotation(points: FloatArray, targets: FloatArray) -> FloatArray:  # [N, 3] centred -> [3, 3]
@@ -84,13 +84,13 @@ def _rotation(points: FloatArray, targets: FloatArray) -> FloatArray:  # [N, 3] 
 
 def _deviations(
     centred: FloatArray,  # [N, 3] as they lie in the targets' frame
-    left: FloatArray,  # [N, 3]
+    residuals: FloatArray,  # [N, 3]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Standard deviations of the middle, mm, and of turns about it, degrees: of 3N residuals and six unknowns."""
-    variance = float(np.square(left).sum()) / (left.size - 6)
+    variance = float(np.square(residuals).sum()) / (residuals.size - 6)
     spread = np.square(centred).sum() * np.eye(3) - centred.T @ centred
     turns = np.degrees(np.sqrt(variance * np.diag(np.linalg.inv(spread))))
-    position = float(np.sqrt(variance / len(left)))
+    position = float(np.sqrt(variance / len(residuals)))
     return (position, position, position), (float(turns[0]), float(turns[1]), float(turns[2]))
 
 
@@ -202,7 +202,7 @@ def _pose_deviations(
     The four points of a pose err together, so that each pose counts as one observation: the covariance is A⁻¹ B A⁻¹, A
     the sum of products of the points' slopes and B that of the poses' slopes (White 1980, clustered).
     """
-    points, left = _as_points(fitted), _as_points(probes) - _as_points(fitted)
+    points, residuals = _as_points(fitted), _as_points(probes) - _as_points(fitted)
     x, y, z = (points - points.mean(axis=0)).T
     nothing, one = np.zeros_like(x), np.ones_like(x)
     slopes = np.array(  # of a point by shifts and turns
@@ -213,7 +213,7 @@ def _pose_deviations(
         ]
     ).transpose(2, 0, 1)  # [4N, 3, 6]
     count = len(probes)
-    of_poses = (left[:, None] @ slopes).reshape(count, -1, 6).sum(axis=1)
+    of_poses = (residuals[:, None] @ slopes).reshape(count, -1, 6).sum(axis=1)
     inverse = np.linalg.inv(np.einsum("nij,nik->jk", slopes, slopes))
     covariance = inverse @ of_poses.T @ of_poses @ inverse * (count / (count - 1))
     shift_x, shift_y, shift_z, turn_x, turn_y, turn_z = np.sqrt(np.diag(covariance)).tolist()

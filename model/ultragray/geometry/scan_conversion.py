@@ -108,5 +108,5 @@ def interpolated_sharply(
     if not len(rows):
         return np.zeros(0)
     x, y = (some.astype(np.float32)[None] for some in (columns, rows))  # a column would take ten times as long as a row
-    found = cv2.remap(frames[which].astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found[0], np.float64)
+    values = cv2.remap(frames[which].astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values[0], np.float64)

@@ -79,12 +79,12 @@ def label_by_frames(
     for frame in frames:
         weights = np.ones(frame.labels.shape, np.float32)
         if labelled.labels is not None:
-            shown = _shown_labels(labelled, probe, frame, backend)
-            weights[shown != frame.labels] = CORRECTION
+            current = _shown_labels(labelled, probe, frame, backend)
+            weights[current != frame.labels] = CORRECTION
         _add_votes(votes, painted, scene, probe, frame, weights, backend)
         labels, voted = _decided(votes, painted, scene)
         # The next frame is held against what these say.
-        labelled = with_labels(scene, labels, known, made=np.zeros(len(labels), bool))
+        labelled = with_labels(scene, labels, known, unrecorded=np.zeros(len(labels), bool))
     return with_labels(scene, _spread(scene, labels, voted, within_mm), known)
 
 
@@ -179,8 +179,8 @@ def _checked_affine(affine: Any) -> FloatArray:  # [4, 4]
 def _shown_labels(scene: GaussianScene, probe: Probe, frame: PaintedFrame, backend: str) -> LabelArray:  # [H, W]
     height, width = frame.labels.shape
     frames = render(scene, probe, frame.pose, height=height, width=width, outputs=("labels",), backend=backend)
-    shown: LabelArray = frames["labels"][0].cpu().numpy()
-    return shown
+    labels: LabelArray = frames["labels"][0].cpu().numpy()
+    return labels
 
 
 def _add_votes(
@@ -208,18 +208,18 @@ def _add_votes(
         sums = planes[WEIGHT_SUM][0].detach()  # [H, W]
         shares = torch.where(sums >= _LEAST_SUM, 1.0 / sums.clamp(min=_LEAST_SUM), 0.0) / _SH_C0
 
-        def given(pixels: Tensor) -> Tensor:  # [H, W] -> [N]
+        def to_gaussians(pixels: Tensor) -> Tensor:  # [H, W] -> [N]
             (by_harmonics,) = torch.autograd.grad(
                 planes[INTENSITY_SUM], harmonics, (pixels * shares)[None], retain_graph=True
             )
             return by_harmonics.flatten()
 
         labels, worth = torch.from_numpy(frame.labels).to(like.device), torch.from_numpy(weights).to(like)
-        shown = given(torch.ones_like(sums))  # of each Gaussian, in pixels
-        reached = (shown > 0.0) & (given((labels != UNPAINTED).to(like)) >= LEAST_PAINTED * shown)
+        areas = to_gaussians(torch.ones_like(sums))  # of each Gaussian, in pixels
+        reached = (areas > 0.0) & (to_gaussians((labels != UNPAINTED).to(like)) >= LEAST_PAINTED * areas)
         for place in np.flatnonzero(np.isin(painted, frame.labels)).tolist():
             of_label = (labels == int(painted[place])) * worth
-            votes[:, place] += torch.where(reached, given(of_label), 0.0)
+            votes[:, place] += torch.where(reached, to_gaussians(of_label), 0.0)
 
 
 def _decided(
@@ -252,15 +252,15 @@ def _spread(
     exact = {"algorithm": 4, "leaf_max_size": 16}  # one k-d tree: its answers are exact, and the same each time
     index = cv2.flann.Index(means_mm[sources], exact)  # type: ignore[arg-type]
     count = min(NEIGHBOURS, len(sources))
-    found, squared = index.knnSearch(means_mm[sought], count, params={"checks": -1})
-    near = sources[found]  # [M, count]
+    indices, squared = index.knnSearch(means_mm[sought], count, params={"checks": -1})
+    near = sources[indices]  # [M, count]
     weights = np.clip(1.0 - squared / within_mm**2, 0.0, None)
     weights[np.abs(echo[near] - echo[sought][:, None]) > SIMILAR_ECHO] = 0.0
     there, places = np.unique(labels[sources], return_inverse=True)  # [L], of each source
     votes = np.zeros((len(sought), len(there)), np.float32)
-    np.add.at(votes, (np.arange(len(sought))[:, None], places[found]), weights)
+    np.add.at(votes, (np.arange(len(sought))[:, None], places[indices]), weights)
     winner = votes.argmax(axis=1)  # [M]
-    is_new = ((weights > 0.0) & voted[near] & (places[found] == winner[:, None])).any(axis=1)
+    is_new = ((weights > 0.0) & voted[near] & (places[indices] == winner[:, None])).any(axis=1)
     spread = labels.copy()
     spread[sought] = np.where(is_new, there[winner], labels[sought])
     return spread
@@ -282,27 +282,27 @@ def labels_of(scene: GaussianScene) -> LabelArray:  # [N], 0: none
 
 def not_recorded(scene: GaussianScene) -> BoolArray:  # [N]
     """The Gaussians that stand for nothing that was recorded."""
-    made: BoolArray = np.isin(labels_of(scene), scene.info.made_labels)
-    return made
+    unrecorded: BoolArray = np.isin(labels_of(scene), scene.info.made_labels)
+    return unrecorded
 
 
 def with_labels(
     scene: GaussianScene,
     labels: LabelArray,  # [N]
     names: Mapping[int, str],
-    made: BoolArray | None = None,  # [N]
+    unrecorded: BoolArray | None = None,  # [N]
 ) -> GaussianScene:
     """The same scene with other labels; with none at all where no label has a name.
 
-    `made`: the Gaussians that nobody recorded; None: those of the scene. They are told by their labels alone: where
-    recorded ones have the same label, or there is none, those that are made get one of their own, NAME (not recorded).
+    `unrecorded`: the Gaussians that nobody recorded; None: those of the scene. Their labels alone tell them from the
+    others: where recorded ones have the same label, or there is none, they get one of their own, NAME (not recorded).
     Raises InvalidArgument where no number is free for that.
     """
-    made = not_recorded(scene) if made is None else made
+    unrecorded = not_recorded(scene) if unrecorded is None else unrecorded
     labels, names = labels.copy(), dict(names)
-    for label in np.unique(labels[made]).tolist():
-        own, name = made & (labels == label), names.get(label, "")
-        while not label or (labels[~made] == label).any():
+    for label in np.unique(labels[unrecorded]).tolist():
+        own, name = unrecorded & (labels == label), names.get(label, "")
+        while not label or (labels[~unrecorded] == label).any():
             name = f"{name} (not recorded)" if name else "not recorded"
             label = label_number(names, name)
             names[label] = name
@@ -310,9 +310,9 @@ def with_labels(
     if not names:
         return replace(scene, labels=None, info=replace(scene.info, label_names={}))
     provenance = scene.info.provenance
-    of_made = {*provenance.get("made", ()), *labels[made].tolist()} - {*labels[~made].tolist()}
-    if of_made or "made" in provenance:
-        provenance = {**provenance, "made": sorted(of_made)}
+    of_unrecorded = {*provenance.get("made", ()), *labels[unrecorded].tolist()} - {*labels[~unrecorded].tolist()}
+    if of_unrecorded or "made" in provenance:
+        provenance = {**provenance, "made": sorted(of_unrecorded)}
     on_device = torch.from_numpy(labels).to(scene.means.device)
     return replace(scene, labels=on_device, info=replace(scene.info, label_names=names, provenance=provenance))
 

@@ -47,13 +47,13 @@ def burnt_in(images: Iterable[ByteArray], count: int) -> list[Mark]:
         return []
     grown = cv2.dilate(marks.astype(np.uint8), np.ones((5, 9), np.uint8))
     _, labels, parts, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
-    found = []
+    result = []
     for label, (left, top, width, height, _) in enumerate(parts[1:].tolist(), start=1):
         box = np.s_[top : top + height, left : left + width]
         mark = marks[box] & (labels[box] == label)
         if np.count_nonzero(mark) >= LEAST_PIXELS and _stands_out(mark, marks[box], low[box]):
-            found.append(Mark(top, left, mark))
-    return sorted(found, key=lambda mark: np.count_nonzero(mark.pixels), reverse=True)
+            result.append(Mark(top, left, mark))
+    return sorted(result, key=lambda mark: np.count_nonzero(mark.pixels), reverse=True)
 
 
 def _stands_out(mark: npt.NDArray[np.bool_], marks: npt.NDArray[np.bool_], low: ByteArray) -> bool:

@@ -77,7 +77,7 @@ class Added(NamedTuple):
 
 def add_motion(
     scene: GaussianScene,
-    asked: MotionSettings,
+    settings: MotionSettings,
     *,
     sweep: Sweep | None = None,
     numbers: Numbers | None = None,  # [F] of its frames; None: they are found
@@ -86,24 +86,24 @@ def add_motion(
     report: Report = lambda step, loss: None,
 ) -> Added:
     """The scene with one mode more: of the sweep, of a field, or built in. Raises InvalidArgument."""
-    asked.check_source(sweep=sweep is not None, field=field is not None)
-    name = asked.mode_name(scene.info.motion)
+    settings.check_source(sweep=sweep is not None, field=field is not None)
+    name = settings.mode_name(scene.info.motion)
     if sweep is not None:
-        spacing_mm = asked.spacing_mm or SPACING_MM
-        options: Any = {"name": name, "steps": asked.steps, "spacing_mm": spacing_mm, "report": report}
+        spacing_mm = settings.spacing_mm or SPACING_MM
+        options: Any = {"name": name, "steps": settings.steps, "spacing_mm": spacing_mm, "report": report}
         if numbers is None:
-            moving, found = find_motion(scene, sweep, **options)
-            return Added(moving, numbers=found)
+            moving, levels = find_motion(scene, sweep, **options)
+            return Added(moving, numbers=levels)
         return Added(fit_motion(scene, sweep, numbers, surrogate=surrogate, **options))
-    tube, spacing_mm = None, asked.spacing_mm or GIVEN_SPACING_MM
-    if asked.chest_mm is not None:
-        field = chest(scene.info, asked.chest_mm)
-    elif asked.pulse_mm is not None:
-        vessel = asked.vessel
+    tube, spacing_mm = None, settings.spacing_mm or GIVEN_SPACING_MM
+    if settings.chest_mm is not None:
+        field = chest(scene.info, settings.chest_mm)
+    elif settings.pulse_mm is not None:
+        vessel = settings.vessel
         assert isinstance(vessel, (LabelShape, TubeShape))
         tube = vessel if isinstance(vessel, TubeShape) else vessel_of(scene, vessel)
-        spacing_mm = asked.spacing_mm or pulsation_spacing_mm(scene, tube)
-        field = pulsation(tube, asked.pulse_mm)
+        spacing_mm = settings.spacing_mm or pulsation_spacing_mm(scene, tube)
+        field = pulsation(tube, settings.pulse_mm)
     assert field is not None
     return Added(*with_mode(scene, Mode(name, 0.0, 1.0), field, spacing_mm), tube=tube)
 
@@ -118,12 +118,12 @@ def read_numbers(path: str | Path) -> Numbers:  # [R]
 
 def numbers_of(sweep: Sweep, numbers: npt.ArrayLike, source: str) -> Numbers:  # [R] of the recording -> [F]
     """Those of a sweep's frames, which may be a part of the recording's. Raises DatasetInvalid."""
-    given, count = np.asarray(numbers, np.float64), int(sweep.frame_numbers.max()) + 1
-    if given.ndim != 1 or len(given) < count or not np.isfinite(given).all():
+    values, count = np.asarray(numbers, np.float64), int(sweep.frame_numbers.max()) + 1
+    if values.ndim != 1 or len(values) < count or not np.isfinite(values).all():
         raise DatasetInvalid(
-            f"{source}: there must be one finite number for each of {count} frames, got {list(given.shape)}"
+            f"{source}: there must be one finite number for each of {count} frames, got {list(values.shape)}"
         )
-    return given[sweep.frame_numbers]
+    return values[sweep.frame_numbers]
 
 
 def fit_motion(
@@ -179,12 +179,12 @@ def find_motion(
         if step and step * ROUNDS // steps > (step - 1) * ROUNDS // steps:
             levels = fit.levels(in_time)
         report(step + 1, fit.step(step / steps, levels))
-    found = levels.double().numpy()
-    low, span = found.min(), np.ptp(found)
+    shares = levels.double().numpy()
+    low, span = shares.min(), np.ptp(shares)
     if not span > 0.0:
         raise InvalidArgument("the frames tell of no motion: their numbers are all the same", field="surrogate")
     mode = Mode(name, 0.0, 1.0, float(-low / span), surrogate="found in the frames")
-    return fit.scene_with(mode, fit.field.detach() * span), (found - low) / span
+    return fit.scene_with(mode, fit.field.detach() * span), (shares - low) / span
 
 
 def depths_in_time(images: npt.NDArray[np.uint8]) -> Numbers:  # [F, H, W] in time -> [F] from -1 to 1
@@ -203,8 +203,8 @@ def depths_in_time(images: npt.NDArray[np.uint8]) -> Numbers:  # [F, H, W] in ti
     half = min(round(0.75 * len(images) / cycles), len(images) - 1)
     window = np.hanning(2 * half + 3)[1:-1]
     depth -= np.convolve(np.pad(depth, half, mode="reflect"), window / window.sum(), "valid")
-    found: Numbers = depth / max(float(np.abs(depth).max()), 1e-9)
-    return found
+    depths: Numbers = depth / max(float(np.abs(depth).max()), 1e-9)
+    return depths
 
 
 class _Fit:
@@ -245,8 +245,8 @@ class _Fit:
         for batch in torch.split(places, 16):
             truth = self._truth[batch].float() / 255.0
             for column, level in enumerate(LEVELS):
-                shown = self._rendered(batch, torch.full((len(batch),), level))
-                errors[batch, column] = (shown - truth).square().mean(dim=(1, 2))
+                rendered = self._rendered(batch, torch.full((len(batch),), level))
+                errors[batch, column] = (rendered - truth).square().mean(dim=(1, 2))
         errors = errors[places]  # in time
         errors /= (errors.amax(dim=1) - errors.amin(dim=1)).mean()
         steps = STEADY * (torch.tensor(LEVELS)[:, None] - torch.tensor(LEVELS)).square()
@@ -258,9 +258,9 @@ class _Fit:
         path = [int(reached.argmin())]
         for come_from in reversed(before):
             path.append(int(come_from[path[-1]]))
-        found = torch.zeros(len(places))
-        found[places] = torch.tensor(LEVELS)[path[::-1]]
-        return found
+        shares = torch.zeros(len(places))
+        shares[places] = torch.tensor(LEVELS)[path[::-1]]
+        return shares
 
     def step(self, done: float, shares: Tensor) -> float:  # [F] -> loss
         """One step of a batch, when a share of all steps is done."""

@@ -128,8 +128,8 @@ def with_moved_modes(scene: GaussianScene, moving: Moving, by: FloatArray) -> Ga
     motion, shift, turn = moving.motion, torch.from_numpy(by[:3, 3]), torch.from_numpy(by[:3, :3])
     if np.array_equal(by[:3, :3], np.eye(3)):
         x, y, z = (np.array(motion.origin_mm) + by[:3, 3]).tolist()
-        led = replace(moving, motion=replace(motion, origin_mm=(x, y, z)))
-        return replace(scene, info=replace(scene.info, motion=led.motion), moving=led)
+        moved = replace(moving, motion=replace(motion, origin_mm=(x, y, z)))
+        return replace(scene, info=replace(scene.info, motion=moved.motion), moving=moved)
     for mode, coefficients in zip(motion.modes, torch.from_numpy(moving.coefficients), strict=True):
         before = Displacement.on_grid(coefficients[None], motion.origin_mm, motion.spacing_mm)
 
@@ -267,10 +267,10 @@ def field_of_voxels(
 
     def looked_up(points: Tensor) -> Tensor:
         places = (points @ to_voxels[:3, :3].T + to_voxels[:3, 3]) * 2.0 / last.clamp(min=1.0) - 1.0
-        found = torch.nn.functional.grid_sample(
+        values = torch.nn.functional.grid_sample(
             volume, places[None, None, None], mode="bilinear", padding_mode="border", align_corners=True
         )
-        return found[0, :, 0, 0].T
+        return values[0, :, 0, 0].T
 
     def inverted(points: Tensor) -> Tensor:
         moved = points

@@ -83,26 +83,26 @@ class NeighboursInTime:
                 f"({train.source}): they have no neighbours in time"
             )
         if not dataset.is_one_recording:
-            known, asked = np.split(places.astype(np.float64), [len(train)])
+            known, targets = np.split(places.astype(np.float64), [len(train)])
         elif train.times_s is None or val.times_s is None:
-            known, asked = (part.frame_numbers.astype(np.float64) for part in (train, val))
+            known, targets = (part.frame_numbers.astype(np.float64) for part in (train, val))
         else:
-            known, asked = train.times_s, val.times_s
+            known, targets = train.times_s, val.times_s
         order = np.argsort(known, kind="stable")
         times = known[order]
-        if len(twice := np.flatnonzero(np.isin(asked, times))):
+        if len(twice := np.flatnonzero(np.isin(targets, times))):
             raise DatasetInvalid(
                 f"{dataset.name}: held-out frames {frame_list(val.frame_numbers[twice])} have the times of training "
                 "frames: they have no neighbours in time"
             )
-        after = np.searchsorted(times, asked)
+        after = np.searchsorted(times, targets)
         pairs = np.clip(np.stack([after - 1, after], axis=1), 0, len(times) - 1)  # [V, 2]
         starts, ends = times[pairs].T
-        return cls(order[pairs], (asked - starts) / np.where(ends > starts, ends - starts, 1.0) * (ends > starts))
+        return cls(order[pairs], (targets - starts) / np.where(ends > starts, ends - starts, 1.0) * (ends > starts))
 
     def frames_of(self, sweep: Sweep) -> npt.NDArray[np.float32]:  # [V, H, W] in [0, 1]
         """The blends of the frames of the training sweep."""
-        found = np.empty((len(self.frames), *sweep.images.shape[1:]), np.float32)
-        for blend, (first, second), share in zip(found, self.frames, self.shares, strict=True):
+        blends = np.empty((len(self.frames), *sweep.images.shape[1:]), np.float32)
+        for blend, (first, second), share in zip(blends, self.frames, self.shares, strict=True):
             blend[:] = blend_in_time(sweep.images[first], sweep.images[second], share) / 255.0
-        return found
+        return blends

@@ -126,5 +126,5 @@ def _agreeing(in_base: FloatArray, localizations: Sequence[Localization]) -> Boo
 def _fit_of(
     flanges: FloatArray, localizations: Sequence[Localization], agreeing: BoolArray, mounting: FloatArray
 ) -> PoseFit:
-    found = np.stack([one.pose for one in localizations])
-    return register_poses(flanges[agreeing], found[agreeing], mounting)
+    poses = np.stack([one.pose for one in localizations])
+    return register_poses(flanges[agreeing], poses[agreeing], mounting)

@@ -170,13 +170,13 @@ class Sweep:
 
 def frame_list(numbers: Iterable[int]) -> str:
     """Frame numbers in words, at most ten of them: `1, 3, 5`; of more than ten those that follow each other as one."""
-    found = [(number, number) for number in map(int, numbers)]
-    if len(found) > 10:
-        for place in range(len(found) - 1, 0, -1):
-            if found[place - 1][1] + 1 == found[place][0]:
-                found[place - 1 : place + 1] = [(found[place - 1][0], found[place][1])]
-    words = [str(a) if a == b else f"{a} to {b}" for a, b in found[:10]]
-    return ", ".join(words) + (", …" if len(found) > 10 else "")
+    ranges = [(number, number) for number in map(int, numbers)]
+    if len(ranges) > 10:
+        for place in range(len(ranges) - 1, 0, -1):
+            if ranges[place - 1][1] + 1 == ranges[place][0]:
+                ranges[place - 1 : place + 1] = [(ranges[place - 1][0], ranges[place][1])]
+    words = [str(a) if a == b else f"{a} to {b}" for a, b in ranges[:10]]
+    return ", ".join(words) + (", …" if len(ranges) > 10 else "")
 
 
 def spread_places(count: int, most: int) -> IntArray:
@@ -211,8 +211,8 @@ def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # 
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
     corners = sweep.corners_mm()
-    asked = sweep.probe.corners_from(poses)
-    return np.array([corner_distances_mm(corners, own).argmin() for own in asked], np.int64)
+    pose_corners = sweep.probe.corners_from(poses)
+    return np.array([corner_distances_mm(corners, own).argmin() for own in pose_corners], np.int64)
 
 
 ON_PATH = 0.5  # of the usual step from frame to frame: as far beside the path between two frames lies one of its own
@@ -231,17 +231,17 @@ def _along_path(sweep: Sweep, others: Sweep) -> FloatArray | None:  # [V]
     if not len(others) or usual_mm == 0.0:
         return None
     squares = np.square(steps).sum(axis=(1, 2))
-    found, beside_mm = np.empty((2, len(others)))
+    places, beside_mm = np.empty((2, len(others)))
     for place, own in enumerate(others.corners_mm()):
         ways = own - starts
         shares = np.clip((ways * steps).sum(axis=(1, 2)) / np.maximum(squares, 1e-12), 0.0, 1.0)
         distances = corner_distances_mm(starts + shares[:, None, None] * steps, own)
         distances[lengths > LONGEST_STEP * usual_mm] = np.inf
         nearest = int(distances.argmin())
-        found[place], beside_mm[place] = nearest + shares[nearest], distances[nearest]
-    back = np.count_nonzero(np.diff(found) < 0.0)
+        places[place], beside_mm[place] = nearest + shares[nearest], distances[nearest]
+    back = np.count_nonzero(np.diff(places) < 0.0)
     is_on = np.median(beside_mm) < ON_PATH * usual_mm and back <= (1.0 - IN_ORDER) * len(others)
-    return np.sort(found) if is_on else None
+    return np.sort(places) if is_on else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,8 +41,8 @@ def _ellipsoid(centre: Triple, radii: Triple) -> Level:
         scaled = (points - middle) / half
         radius = np.linalg.norm(scaled, axis=1)
         steepness = np.linalg.norm(scaled / half, axis=1)
-        found: Floats = (radius - 1.0) * radius / np.maximum(steepness, 1e-6)
-        return found
+        levels: Floats = (radius - 1.0) * radius / np.maximum(steepness, 1e-6)
+        return levels
 
     return level
 
@@ -55,8 +55,8 @@ def _tube(path: list[Triple], radius: float) -> Level:
         for start, way in zip(places[:-1], np.diff(places, axis=0), strict=True):
             along = np.clip((points - start) @ way / (way @ way), 0.0, 1.0)
             nearest = np.minimum(nearest, np.linalg.norm(points - start - along[:, None] * way, axis=1))
-        found: Floats = nearest - np.float32(radius)
-        return found
+        levels: Floats = nearest - np.float32(radius)
+        return levels
 
     return level
 
@@ -101,8 +101,8 @@ def _pyramids(points: Floats) -> Floats:
     x, y, z = (points - np.array([7.0, 22.0, 80.0], np.float32)).T
     around = np.cos(5.0 * np.arctan2(z / 19.0, x / 25.0)) * np.cos(np.pi * y / 15.0)
     depth = np.abs(kidney(points) + 8.5) - 4.0  # between the sinus and the cortex
-    found: Floats = np.maximum(depth, 3.0 * (0.1 - around))
-    return found
+    levels: Floats = np.maximum(depth, 3.0 * (0.1 - around))
+    return levels
 
 
 def straightened(points: Floats) -> Floats:  # [N, 3] -> [N, 3]

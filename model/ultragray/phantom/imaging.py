@@ -76,7 +76,7 @@ class ScattererField:
 
     def _block(self, index: tuple[int, int, int]) -> Scatterers:
         if index not in self._blocks:
-            self._blocks[index] = _made(self._phantom, index)
+            self._blocks[index] = _scatterers(self._phantom, index)
         return self._blocks[index]
 
 
@@ -94,7 +94,7 @@ def _blocks_near(pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> I
 
 
 @lru_cache(maxsize=LAST_BLOCKS)
-def _made(phantom: Phantom, index: tuple[int, int, int]) -> Scatterers:
+def _scatterers(phantom: Phantom, index: tuple[int, int, int]) -> Scatterers:
     rng = np.random.default_rng([_SEED, *(i + _OFFSET for i in index)])
     count = round(PER_MM3 * BLOCK_MM**3)
     points: Float32Array = ((np.asarray(index) + rng.random((count, 3))) * BLOCK_MM).astype(np.float32)
@@ -263,8 +263,8 @@ class Grid:
     def _tissue(self, pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:
         across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
         points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
-        found = self.phantom.tissue_at(points.reshape(-1, 3).astype(np.float32))
-        return found.reshape(len(depths_mm), len(laterals_mm))
+        tissues = self.phantom.tissue_at(points.reshape(-1, 3).astype(np.float32))
+        return tissues.reshape(len(depths_mm), len(laterals_mm))
 
     def above(self, per_mm: FloatArray) -> FloatArray:  # [R, C] -> [R, C]
         """The sum of something over each scan line, from the probe's face down to the middle of each cell."""

@@ -75,7 +75,7 @@ def _recipe(
     high_mm: tuple[float, float, float],
     settings: Mapping[str, Any],
 ) -> tuple[SceneRecipe, BodySpace]:
-    given: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "towards": (0.0, 0.0, 1.0),
         "along": (0.0, 1.0, 0.0),
         "frequency_mhz": FREQUENCY_MHZ,
@@ -83,7 +83,7 @@ def _recipe(
         "level": MUSCLE_GREY + LOOKS_DB / DYNAMIC_RANGE_DB,
         "compensated": COMPENSATED,
     }
-    recipe = SceneRecipe(bodies=tuple(bodies), probe=probe, **{**given, **settings})
+    recipe = SceneRecipe(bodies=tuple(bodies), probe=probe, **{**defaults, **settings})
 
     def number_at(points: FloatArray) -> Any:
         return phantom.tissue_at(points.astype(np.float32))

@@ -49,8 +49,8 @@ class SupportWatch:
         if self._mask_below is None:
             return None
         extrapolations = self._extrapolations[self._count - len(shares) : self._count]
-        found = self._assessor.with_support(extrapolations, shares.tolist())
-        masked = [not is_confident(one, self._mask_below) for one in found]
+        assessments = self._assessor.with_support(extrapolations, shares.tolist())
+        masked = [not is_confident(one, self._mask_below) for one in assessments]
         if not any(masked):
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
@@ -64,14 +64,14 @@ class SupportWatch:
         """The extrapolations of some frames with what was seen of them; waits for a GPU to have rendered."""
         self._shares.extend(share for some in self._noted for share in some.tolist())
         self._noted.clear()
-        found = self._assessor.with_support(self._extrapolations[first:stop], self._shares[first:stop])
+        extrapolations = self._assessor.with_support(self._extrapolations[first:stop], self._shares[first:stop])
         if not (self._contacts and self._contacts[0]):
-            return found
+            return extrapolations
         judged = {
             name: np.concatenate([one[name] for one in self._contacts])[first:stop].tolist()
             for name in self._contacts[0]
         }
-        return [replace(one, **{name: judged[name][at] for name in judged}) for at, one in enumerate(found)]
+        return [replace(one, **{name: judged[name][at] for name in judged}) for at, one in enumerate(extrapolations)]
 
 
 def supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]

@@ -122,29 +122,29 @@ def render_labels(drawing: Drawing, weight_sum: str) -> Tensor:  # [C, H, W] uin
     with torch.no_grad():
         parts = scene.prepared("labels", lambda: label_parts(scene))
         weights = ((label, drawing.plane_of(part, weight_sum)) for label, part in parts)
-        found = heaviest_labels(weights, scene.means.new_zeros(drawing.shape))
-    drawing.mark_tools(found)
-    return found
+        labels = heaviest_labels(weights, scene.means.new_zeros(drawing.shape))
+    drawing.mark_tools(labels)
+    return labels
 
 
 def heaviest_labels(weights: Iterable[tuple[int, Tensor]], heaviest: Tensor) -> Tensor:  # [C, H, W] each
     """The label of the largest weight at each pixel, uint8; 0 where none reaches 1/255. `heaviest`: zeros, changed."""
-    found = torch.zeros(heaviest.shape, dtype=torch.uint8, device=heaviest.device)
+    labels = torch.zeros(heaviest.shape, dtype=torch.uint8, device=heaviest.device)
     for label, weight in weights:
-        _keep_heavier(found, heaviest, label, weight)
-    return found
+        _keep_heavier(labels, heaviest, label, weight)
+    return labels
 
 
-def _keep_heavier(found: Tensor, heaviest: Tensor, label: int, weight: Tensor) -> None:  # [C, H, W] each
+def _keep_heavier(labels: Tensor, heaviest: Tensor, label: int, weight: Tensor) -> None:  # [C, H, W] each
     """Puts a label where it weighs more than those before it, and what it weighs there."""
-    if found.is_cuda:
+    if labels.is_cuda:
         heavier = (weight > heaviest) & (weight >= MIN_WEIGHT_SUM)
-        found.masked_fill_(heavier, label)
+        labels.masked_fill_(heavier, label)
         heaviest.copy_(torch.where(heavier, weight, heaviest))
     else:  # by numpy: on a busy machine the threads of torch wait for each other longer than a frame takes
         most, own = heaviest.numpy(), weight.numpy()
         more = (own > most) & (own >= MIN_WEIGHT_SUM)
-        np.copyto(found.numpy(), np.uint8(label), where=more)
+        np.copyto(labels.numpy(), np.uint8(label), where=more)
         np.copyto(most, own, where=more)
 
 
@@ -199,8 +199,8 @@ def deviations(drawing: Drawing, names: Sequence[str]) -> Tensor:  # [C, H, W]
     scene = drawing.scene
     planes = {name: drawing.plane(name) for name in names}
     if (recorded := recorded_part(scene)) is not scene:
-        shown = planes["coverage"]
-        planes["coverage"] = torch.zeros_like(shown) if recorded is None else drawing.plane_of(recorded, "coverage")
+        coverage = planes["coverage"]
+        planes["coverage"] = torch.zeros_like(coverage) if recorded is None else drawing.plane_of(recorded, "coverage")
     model = read_model(scene.info.confidence, len(scene.training_poses))
     assert model is not None
     assert model.uncertainty is not None

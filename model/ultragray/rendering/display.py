@@ -105,8 +105,8 @@ class Display(Contract):
     def picture(self, probe: Probe, height: int, width: int) -> Picture:
         """Size and place of what frames of height x width are shown as. Raises InvalidImageSize for a huge one."""
         rows = self.rows_shown(probe, height)
-        shown = probe.cropped(rows / height)
-        picture = shown.frame_picture(rows, width) if self.pixel_mm is None else shown.picture(self.pixel_mm)
+        cropped = probe.cropped(rows / height)
+        picture = cropped.frame_picture(rows, width) if self.pixel_mm is None else cropped.picture(self.pixel_mm)
         if max(picture.height, picture.width) > MAX_IMAGE_SIDE:
             raise InvalidImageSize(
                 f"a picture may have at most {MAX_IMAGE_SIDE} pixels on a side, pixels of {self.pixel_mm:g} mm make it "

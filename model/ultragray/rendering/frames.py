@@ -151,10 +151,10 @@ def render(
     speckle = _one_of(Speckle, speckle, "speckle")
     check_speckle(speckle, scene.info)
     speckle_by = chosen_backend if speckle is Speckle.NATURAL else None
-    shown = beam_cm(scene.info.beam if beam is None else beam, view[0])
-    sight = _tools_in_view(tools, view, poses, shown)
+    scene_beam = beam_cm(scene.info.beam if beam is None else beam, view[0])
+    sight = _tools_in_view(tools, view, poses, scene_beam)
     touching = None if touch is None else touch.lines
-    drawing = Drawing(draw, scene, view, limits, shown, touching, sight, ghost, speckle_by)
+    drawing = Drawing(draw, scene, view, limits, scene_beam, touching, sight, ghost, speckle_by)
     drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
     return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen}, touch, pressing)
 
@@ -186,8 +186,8 @@ def render_grey(
     if draw is None:
         return None
     known = scene.info.probe_or(probe)
-    shown = beam_cm(scene.info.beam if beam is None else beam, known)
-    grey, shares = draw(scene, known, scene_poses(scene, poses), height, width, SUPPORT_COVERAGE, limits, shown)
+    scene_beam = beam_cm(scene.info.beam if beam is None else beam, known)
+    grey, shares = draw(scene, known, scene_poses(scene, poses), height, width, SUPPORT_COVERAGE, limits, scene_beam)
     if touch is not None:
         pixels = grey.numpy()
         np.multiply(pixels, touch.lines[:, None], out=pixels)
@@ -299,13 +299,13 @@ def render_shown(
         return rendered
     if not settings.display.varies:
         return show(rendered, settings.probe, settings.display, blackened)
-    shown = []
+    pictures = []
     for place, pose in enumerate(poses):
         one = slice(place, place + 1)
         mask = None if blackened is None else blackened[one]
         frame = {name: pixels[one] for name, pixels in rendered.items()}
-        shown.append(show(frame, settings.probe, settings.display.of_frame(pose), mask))
-    return {name: torch.cat([frame[name] for frame in shown]) for name in rendered}
+        pictures.append(show(frame, settings.probe, settings.display.of_frame(pose), mask))
+    return {name: torch.cat([frame[name] for frame in pictures]) for name in rendered}
 
 
 def recorded_coverage(
@@ -320,8 +320,8 @@ def recorded_coverage(
     recorded = recorded_part(scene)
     if recorded is None:
         return scene.means.new_zeros((len(poses), settings.height, settings.width))
-    shown = _plane_settings(settings)
-    return render(recorded, poses=poses, outputs=("coverage",), backend=backend, limits=limits, **shown)["coverage"]
+    shared = _plane_settings(settings)
+    return render(recorded, poses=poses, outputs=("coverage",), backend=backend, limits=limits, **shared)["coverage"]
 
 
 def _plane_settings(settings: Resolved) -> dict[str, Any]:
@@ -342,23 +342,23 @@ def show(
 
     Pixels that are `blackened`, [C, H, W] bool, are 0 in every output but those that tell support, whatever the gain.
     """
-    shown = {}
+    images = {}
     for name, pixels in frames.items():
         rows = display.rows_shown(probe, pixels.shape[1])
-        shown[name] = pixels[:, :rows]
+        images[name] = pixels[:, :rows]
         if OUTPUTS[name].is_toned and display.changes_tone:
-            shown[name] = _toned(shown[name], display)
+            images[name] = _toned(images[name], display)
         if OUTPUTS[name].is_toned and display.edge:
-            shown[name] = _edged(shown[name], display.edge)
+            images[name] = _edged(images[name], display.edge)
         if blackened is not None and not OUTPUTS[name].tells_support:
-            shown[name] = shown[name].masked_fill(blackened[:, :rows], 0)
+            images[name] = images[name].masked_fill(blackened[:, :rows], 0)
         if display.pixel_mm is not None:
             cropped = probe.cropped(rows / pixels.shape[1])
-            shown[name] = _scan_converted(shown[name], cropped, display.pixel_mm, nearest=OUTPUTS[name].is_numbers)
+            images[name] = _scan_converted(images[name], cropped, display.pixel_mm, nearest=OUTPUTS[name].is_numbers)
         if display.flip:
-            shown[name] = shown[name].flip(2)
-        shown[name] = shown[name].contiguous()
-    return shown
+            images[name] = images[name].flip(2)
+        images[name] = images[name].contiguous()
+    return images
 
 
 def _toned(bmode: Tensor, display: Display) -> Tensor:  # [C, H, W] -> [C, H, W]
@@ -383,9 +383,9 @@ def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: b
     if probe.lines.wrap:
         floats = torch.cat([floats[..., -1:], floats, floats[..., :1]], dim=-1)
     mode = "nearest" if nearest else "bilinear"
-    shown = grid_sample(floats[None], grid.to(floats), mode, padding_mode="border", align_corners=False)[0]
-    shown *= inside
-    return shown if frames.is_floating_point() else shown.round_().to(frames.dtype)
+    pixels = grid_sample(floats[None], grid.to(floats), mode, padding_mode="border", align_corners=False)[0]
+    pixels *= inside
+    return pixels if frames.is_floating_point() else pixels.round_().to(frames.dtype)
 
 
 def _grid(

@@ -35,8 +35,8 @@ class ToolsInView:
 
         `like` has the device and the type of the planes, of which there may be none: the labels are known then.
         """
-        found = (_Drawn.of(tool, self._view, height, like) for tool in self._tools)
-        self._marks = [one for one in found if one is not None]
+        marks = (_Drawn.of(tool, self._view, height, like) for tool in self._tools)
+        self._marks = [one for one in marks if one is not None]
         for one in self._marks:
             one.draw(planes)
 

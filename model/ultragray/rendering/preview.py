@@ -123,13 +123,13 @@ class Previewer:
         motion = _Motion.between(self._probe, before, new.pose)
         kept = _bands(motion.carried(self._left(before)))
         came = _bands(self._left(new))
-        shown = self._foretold(before, new.rendered, motion)
+        prediction = self._foretold(before, new.rendered, motion)
         rates = _MEMORY * _knot_weights(motion.out_mm)
         self._squares += rates * (np.mean(kept * kept, axis=(1, 2))[:, None] - self._squares)
         self._products += rates * (np.mean(kept * came, axis=(1, 2))[:, None] - self._products)
         rates = _MEMORY * _knot_weights(motion.all_mm)
         self._known += rates * (1.0 - self._known)
-        self._missed += rates * (float(np.mean((shown - new.real) ** 2)) - self._missed)
+        self._missed += rates * (float(np.mean((prediction - new.real) ** 2)) - self._missed)
         self._missed_late += rates * (float(np.mean((before.real - new.real) ** 2)) - self._missed_late)
 
     def _foretold(self, late: _Pair, rendered: Grey, motion: _Motion) -> Grey:
@@ -139,8 +139,8 @@ class Previewer:
         shares = (self._products @ weights + assumed * np.exp(-motion.out_mm / _HELD_MM)) / (
             self._squares @ weights + assumed + _TINY
         )
-        shown = self._mapped(rendered) + np.tensordot(np.clip(shares, 0.0, 1.0).astype(np.float32), kept, 1)
-        return cast(Grey, np.clip(shown, 0.0, 1.0))
+        prediction = self._mapped(rendered) + np.tensordot(np.clip(shares, 0.0, 1.0).astype(np.float32), kept, 1)
+        return cast(Grey, np.clip(prediction, 0.0, 1.0))
 
     def _left(self, pair: _Pair) -> Grey:
         """What the scene misses of a real frame."""

@@ -81,8 +81,8 @@ MAX_INDENTATION_MM = 50.0
 def check_indentation(indentation_mm: float | None, contact: Contact | None) -> None:
     """Raises InvalidArgument for an indentation that is asked for without pressure."""
     if indentation_mm is not None and contact is not Contact.PRESSURE:
-        got = "none" if contact is None else contact.value
-        raise InvalidArgument(f"indentation_mm needs contact pressure, got contact {got}", field="indentation_mm")
+        name = "none" if contact is None else contact.value
+        raise InvalidArgument(f"indentation_mm needs contact pressure, got contact {name}", field="indentation_mm")
 
 
 class Speckle(str, Enum):
@@ -205,7 +205,7 @@ class FrameSettings(Contract):
             )
         check_speckle(self.speckle, info)
         check_motion(self.phase, self.breathing, info)
-        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
+        additions = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return Resolved(
             probe=info.probe_or(self.probe),
             beam=info.beam_or(self.slice_thickness_mm),
@@ -215,7 +215,7 @@ class FrameSettings(Contract):
             encoding=encoding,
             display=self.display or AS_RENDERED,
             breathing=self.breathing,
-            **{name: value for name, value in given.items() if value is not None},
+            **{name: value for name, value in additions.items() if value is not None},
         )
 
 
@@ -345,8 +345,8 @@ class SettingsUsed(Additions):
     def document(self) -> dict[str, Any]:
         """The settings as JSON holds them, but for additions that were not asked for."""
         plain = {one.name: one.default for one in fields(Additions)}
-        told = (one.name for one in fields(self) if plain.get(one.name, MISSING) != getattr(self, one.name))
-        return {name: to_dict(getattr(self, name)) for name in told}
+        names = (one.name for one in fields(self) if plain.get(one.name, MISSING) != getattr(self, one.name))
+        return {name: to_dict(getattr(self, name)) for name in names}
 
     def texts(self) -> dict[str, str]:
         """The same with a text for each: words and numbers as they are, lists of words with commas, else JSON."""

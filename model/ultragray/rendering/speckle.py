@@ -336,13 +336,13 @@ def with_speckle(
     plain = bmode.detach()
     size = (int(bmode.shape[1]), int(bmode.shape[2]))
     if backend == "reference":
-        shown = added(model, plain, torch.from_numpy(speckle(model, axes, probe, poses, size)).to(plain))
+        speckled_bmode = added(model, plain, torch.from_numpy(speckle(model, axes, probe, poses, size)).to(plain))
     elif plain.device.type == "cpu":
-        shown = kernel_speckle(model, axes, probe, poses, plain)
+        speckled_bmode = kernel_speckle(model, axes, probe, poses, plain)
     else:
         pattern = kernel_speckle(model, axes, probe, poses, torch.empty(plain.shape, device="cpu"), alone=True)
-        shown = added(model, plain, pattern.to(plain))
-    return shown if not bmode.requires_grad else bmode + (shown - plain)
+        speckled_bmode = added(model, plain, pattern.to(plain))
+    return speckled_bmode if not bmode.requires_grad else bmode + (speckled_bmode - plain)
 
 
 def sweep_axes(poses: FloatArray) -> FloatArray:  # [P, 4, 4] -> [3, 3]

@@ -79,9 +79,9 @@ def assessed_part(
     """
     if isinstance(sampler, DrawnSampler):
         blocks = range(first // BLOCK_POSES, -(-last // BLOCK_POSES))
-        made, found = _of_blocks(sampler, base, probe, assess, min_confidence, blocks)
+        block_poses, assessments = _of_blocks(sampler, base, probe, assess, min_confidence, blocks)
         places = slice(first - blocks.start * BLOCK_POSES, last - blocks.start * BLOCK_POSES)
-        return made[places], found[places]
+        return block_poses[places], assessments[places]
     if sampler is not None and min_confidence is not None:
         require_drawn(sampler)
     poses = (check_poses(base) if sampler is None else sampler.poses(base, probe))[first:last]
@@ -108,12 +108,12 @@ def _of_blocks(
     for number in blocks:
         block = sampler.block(number)
         if min_confidence is None:
-            made = block.poses(base, probe)
-            found = assess(made)
+            block_poses = block.poses(base, probe)
+            assessments = assess(block_poses)
         else:
-            made, found = _drawn_on(block, base, probe, assess, min_confidence)
-        poses.append(made)
-        extrapolations.extend(found)
+            block_poses, assessments = _drawn_on(block, base, probe, assess, min_confidence)
+        poses.append(block_poses)
+        extrapolations.extend(assessments)
     return np.concatenate(poses), extrapolations
 
 
@@ -125,20 +125,20 @@ def _drawn_on(
     extrapolations: list[Extrapolation] = []
     drawn, rounds, draw = 0, 0, sampler
     while True:
-        made = draw.poses(base, probe)
-        for pose, extrapolation in zip(made, assess(made), strict=True):
+        candidates = draw.poses(base, probe)
+        for pose, extrapolation in zip(candidates, assess(candidates), strict=True):
             if is_confident(extrapolation, min_confidence):
                 poses.append(pose)
                 extrapolations.append(extrapolation)
-        drawn, rounds, found = drawn + len(made), rounds + 1, len(poses)
-        if found >= count:
+        drawn, rounds, hits = drawn + len(candidates), rounds + 1, len(poses)
+        if hits >= count:
             return np.stack(poses[:count]), extrapolations[:count]
         if drawn >= most:
             raise LowConfidence(
-                f"sampler {sampler.kind} found {found:,} of {count:,} poses with a confidence of at least "
-                f"{min_confidence:g}: {found / drawn:.2%} of {drawn:,} drawn have it",
+                f"sampler {sampler.kind} found {hits:,} of {count:,} poses with a confidence of at least "
+                f"{min_confidence:g}: {hits / drawn:.2%} of {drawn:,} drawn have it",
                 field="sampler",
             )
-        wanted = math.ceil(SPARE * (count - found) * drawn / max(found, 1))
+        wanted = math.ceil(SPARE * (count - hits) * drawn / max(hits, 1))
         size = min(max(wanted, SMALLEST_ROUND), max(count, SMALLEST_ROUND), most - drawn)
         draw = sampler.with_draws(size, seed_of(sampler.seed, rounds))

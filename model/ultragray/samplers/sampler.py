@@ -35,13 +35,13 @@ class Sampler(Family):
         checked = check_poses(base)
         if not len(checked):
             raise InvalidArgument(f"sampler {self.kind} needs base poses, got none", field="kind")
-        return check_poses(self._made(checked, probe))
+        return check_poses(self._new_poses(checked, probe))
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         raise NotImplementedError
 
-    def _require_few(self, made: float, name: str) -> None:
-        if made > MAX_POSES:
+    def _require_few(self, count: float, name: str) -> None:
+        if count > MAX_POSES:
             raise InvalidArgument(
                 f"{name} {getattr(self, name):g} gives more than the {MAX_POSES:,} poses that can be made", field=name
             )
@@ -79,7 +79,7 @@ class DrawnSampler(Sampler):
                 field="count",
             )
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         self.require_few()
         return np.concatenate([self.block(number)._drawn(base, probe) for number in range(self.block_count)])
 
@@ -166,15 +166,15 @@ class CoveredSampler(DrawnSampler):
         links = links[np.minimum(places, np.flatnonzero(lengths)[-1])]
         first, second = base[links[:, 0]], base[links[:, 1]]
         shares = random.uniform(size=self.count)
-        made = np.tile(np.eye(4), (self.count, 1, 1))
+        poses = np.tile(np.eye(4), (self.count, 1, 1))
         steps = second[:, :3, 3] - first[:, :3, 3]
-        made[:, :3, 3] = first[:, :3, 3] + shares[:, None] * steps
-        made[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
+        poses[:, :3, 3] = first[:, :3, 3] + shares[:, None] * steps
+        poses[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
         radii = np.linalg.norm(steps, axis=1) * np.cbrt(random.uniform(size=self.count))
-        made[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
+        poses[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
         turns = turn_angles_rad(first[:, :3, :3], second[:, :3, :3]) * random.uniform(size=self.count)
-        made[:, :3, :3] = made[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
-        return made
+        poses[:, :3, :3] = poses[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
+        return poses
 
 
 @lru_cache(1)  # the same for all blocks
@@ -212,7 +212,7 @@ class FanSampler(Sampler):
     step_deg: float = described("Between two tilts.", above=0.0, high=MAX_TILT_DEG)
     kind: Literal["fan"] = kind_field("fan")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         steps = math.floor(min(self.tilt_deg / self.step_deg, 1e9) + 1e-9)
         tilts = 2 * steps + 1
         self._require_few(float(tilts) * len(base), "step_deg")
@@ -247,7 +247,7 @@ class SplineSampler(Sampler):
         if (self.count is None) == (self.spacing_mm is None):
             raise InvalidArgument("exactly one of count and spacing_mm must be given", field="count")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         knots = _without_repetitions(base)
         if len(knots) < 2:
             raise InvalidArgument("sampler spline needs at least two different base poses, got one", field="kind")
@@ -256,10 +256,10 @@ class SplineSampler(Sampler):
         places = self._places(float(at[-1]))
         segments = np.clip(np.searchsorted(at, places, side="right") - 1, 0, len(lengths) - 1)
         shares = (places - at[segments]) / lengths[segments]
-        made = np.tile(np.eye(4), (len(places), 1, 1))
-        made[:, :3, 3] = _natural_cubic(knots[:, :3, 3], lengths, segments, shares)
-        made[:, :3, :3] = blended(knots[segments, :3, :3], knots[segments + 1, :3, :3], shares)
-        return made
+        poses = np.tile(np.eye(4), (len(places), 1, 1))
+        poses[:, :3, 3] = _natural_cubic(knots[:, :3, 3], lengths, segments, shares)
+        poses[:, :3, :3] = blended(knots[segments, :3, :3], knots[segments + 1, :3, :3], shares)
+        return poses
 
     def _places(self, length_mm: float) -> FloatArray:  # [C]
         if self.count is not None:
@@ -320,5 +320,5 @@ class TrainingSampler(Sampler):
 
     kind: Literal["training"] = kind_field("training")
 
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _new_poses(self, base: FloatArray, probe: Probe) -> FloatArray:
         return base

@@ -56,12 +56,12 @@ def checked_tensor(description: str, *poses: npt.NDArray[Any] | None) -> bytes:
     return _HEAD.pack(COMPRESSED_FORMAT, checksum)
 
 
-def check_tensor(found: bytes, description: str, *poses: npt.NDArray[Any] | None) -> None:
+def check_tensor(data: bytes, description: str, *poses: npt.NDArray[Any] | None) -> None:
     """Raises ValueError where what COMPRESSED_TENSOR holds is of another version, or of other bytes."""
     expected = checked_tensor(description, *poses)
-    if len(found) == len(expected):
-        require_version(_HEAD.unpack(found)[0], COMPRESSED_FORMAT)
-    if found != expected:
+    if len(data) == len(expected):
+        require_version(_HEAD.unpack(data)[0], COMPRESSED_FORMAT)
+    if data != expected:
         raise ValueError("its description or its poses are damaged: their checksum differs")
 
 
@@ -142,8 +142,8 @@ def _axes_after(turn: tuple[float, ...]) -> list[int]:
     w, *v = turn
     across = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     matrix = (w * w - np.dot(v, v)) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * across
-    found: list[int] = np.abs(matrix).argmax(axis=0).tolist()
-    return found
+    axes: list[int] = np.abs(matrix).argmax(axis=0).tolist()
+    return axes
 
 
 def _placed(
@@ -188,12 +188,12 @@ def _part(table: Sequence[tuple[float, float, Integers]], rest_bits: int) -> byt
 def unpack(parts: Sequence[bytes], count: int, sh_degree: int, has_labels: bool) -> dict[str, npt.NDArray[Any]]:
     """Raw parameters [N, ...], and labels [N], of N = `count` Gaussians. Raises ValueError where a part is damaged."""
     names = column_names(sh_degree, has_labels)
-    left, unpacked = count, []
+    rest, unpacked = count, []
     for index, part in enumerate(parts):
-        unpacked.append(_unpacked(part, names, left, f"its {part_name(index)}"))
-        left -= len(unpacked[-1]["means"])
-    if left:
-        raise ValueError(f"its parts hold {count - left} Gaussians, its description says {count}")
+        unpacked.append(_unpacked(part, names, rest, f"its {part_name(index)}"))
+        rest -= len(unpacked[-1]["means"])
+    if rest:
+        raise ValueError(f"its parts hold {count - rest} Gaussians, its description says {count}")
     return {name: np.concatenate([one[name] for one in unpacked]) for name in unpacked[0]}
 
 

@@ -73,9 +73,9 @@ class TrainingViews:
 
     def interpolation_mm(self, points: FloatArray) -> FloatArray:  # [K, 3] mm -> [K]
         """As `ViewMeasures` has it, of any points of the scene's frame."""
-        found = np.empty(len(points))
-        self._views.interpolation_mm(np.ascontiguousarray(points, np.float32), found)
-        return found
+        distances_mm = np.empty(len(points))
+        self._views.interpolation_mm(np.ascontiguousarray(points, np.float32), distances_mm)
+        return distances_mm
 
     def _measured(
         self, poses: FloatArray, probe: Probe, points_per_side: int
@@ -83,9 +83,9 @@ class TrainingViews:
         points = _image_points(probe, points_per_side)
         nearest_mm, distance_mm, interpolation_mm, angle_deg = np.empty((4, len(poses), len(points)))
         weights, around_mm = np.empty((2, len(poses), self._count))
-        found = ViewMeasures(nearest_mm, distance_mm, interpolation_mm, angle_deg, weights)
-        self._views.measure(np.ascontiguousarray(poses), points, **vars(found), around_mm=around_mm)
-        return found, around_mm
+        measures = ViewMeasures(nearest_mm, distance_mm, interpolation_mm, angle_deg, weights)
+        self._views.measure(np.ascontiguousarray(poses), points, **vars(measures), around_mm=around_mm)
+        return measures, around_mm
 
 
 @lru_cache(maxsize=64)
@@ -155,8 +155,8 @@ class Uncertainty:
 
 def _check_keys(name: str, document: Any, keys: set[str]) -> None:
     if not isinstance(document, Mapping) or set(document) != keys:
-        found = sorted(document) if isinstance(document, Mapping) else document
-        raise InvalidArgument(f"{name} must be an object with the keys {sorted(keys)}, got {found!r}", field=name)
+        content = sorted(document) if isinstance(document, Mapping) else document
+        raise InvalidArgument(f"{name} must be an object with the keys {sorted(keys)}, got {content!r}", field=name)
 
 
 def _numbers(name: str, values: Any, count: int | None = None, low: float = -math.inf) -> tuple[float, ...]:
@@ -402,18 +402,18 @@ class Assessor:
         if self._model is not None:
             confidences = [trust * one for one in self._model.predict(measures)]
         away = (measures.nearest_mm.mean(axis=1).tolist(), measures.angle_deg.mean(axis=1).tolist())
-        found = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
-        return found if coverage is None else self.with_support(found, shares)
+        extrapolations = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
+        return extrapolations if coverage is None else self.with_support(extrapolations, shares)
 
     def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
         """The extrapolations of rendered frames, completed with the share of each one's pixels that has support."""
-        found = []
+        results = []
         for one, share in zip(extrapolations, shares, strict=True):
             confidence = one.confidence
             if self._model is not None and confidence is not None:
                 confidence = self._model.limited(confidence, share)
-            found.append(replace(one, confidence=confidence, supported_share=share))
-        return found
+            results.append(replace(one, confidence=confidence, supported_share=share))
+        return results
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

@@ -98,10 +98,10 @@ class Displacement:
         to_grid = torch.from_numpy(self.to_grid[pose if len(self.to_grid) > 1 else 0]).to(points)
         size = points.new_tensor(coefficients.shape[:3])
         grid = points @ to_grid[:, :3].T + to_grid[:, 3]
-        held = torch.minimum(grid.clamp(min=1.0), size - 2)
-        cell = torch.minimum(held.detach().floor(), size - 3)
-        values, slopes = _splines(held - cell)  # [N, 3, 4] each
-        slopes = slopes * (held == grid)[..., None]
+        places = torch.minimum(grid.clamp(min=1.0), size - 2)
+        cell = torch.minimum(places.detach().floor(), size - 3)
+        values, slopes = _splines(places - cell)  # [N, 3, 4] each
+        slopes = slopes * (places == grid)[..., None]
         first = cell.long() - 1
         x, y, z = (first[:, axis, None] + torch.arange(4, device=points.device) for axis in range(3))
         taps = coefficients[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]  # [N, 4, 4, 4, 3]

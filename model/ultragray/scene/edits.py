@@ -208,11 +208,11 @@ def edits_of(document: Any) -> tuple[Edit, ...]:
         document = document.get("edits")
     if not isinstance(document, Sequence) or isinstance(document, str):
         raise InvalidArgument("edits must be a list", field="edits")
-    found = []
+    edits = []
     for index, one in enumerate(document):
         with under(f"edits[{index}]"):
-            found.append(from_dict(Edit, one))
-    return check_edits(tuple(found))
+            edits.append(from_dict(Edit, one))
+    return check_edits(tuple(edits))
 
 
 def check_edits(edits: Sequence[Edit]) -> tuple[Edit, ...]:

@@ -64,7 +64,7 @@ class _Kept(NamedTuple):
     tensors: tuple[Tensor, ...]
     versions: tuple[int, ...]
     intensity: str
-    made: Any
+    value: Any
 
     def is_of(self, tensors: tuple[Tensor, ...], intensity: str) -> bool:
         """Whether it was made of these, as they are now."""
@@ -213,8 +213,8 @@ class GaussianScene:
             versions = tuple(tensor._version for tensor in tensors)
             kept = _Kept(tensors, versions, self.info.intensity, make())
             self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
-        made: Prepared = kept.made
-        return made
+        preparation: Prepared = kept.value
+        return preparation
 
     @property
     def tissue(self) -> FollowingTissue | None:
@@ -372,9 +372,9 @@ def _check_values(name: str, tensor: Tensor) -> None:  # [N, ...]
         wrong, expected = values.norm(dim=1) < LEAST_NORM, "not be zero"
     if wrong.any():
         first = int(wrong.nonzero()[0])
-        got = ", ".join(f"{value:.6g}" for value in values[first].tolist())
+        numbers = ", ".join(f"{value:.6g}" for value in values[first].tolist())
         raise InvalidArgument(
-            f"splats[{name!r}] must {expected}, got [{got}] for Gaussian {first} ({int(wrong.sum())} are wrong)",
+            f"splats[{name!r}] must {expected}, got [{numbers}] for Gaussian {first} ({int(wrong.sum())} are wrong)",
             field=name,
         )
 
@@ -388,11 +388,11 @@ def _names_of_labels(labels: Any, means: Tensor, known: Mapping[int, str]) -> di
             )
         return {}
     if not isinstance(labels, Tensor) or labels.dtype != torch.uint8 or labels.shape != means.shape[:1]:
-        got = f"{labels.dtype} {list(labels.shape)}" if isinstance(labels, Tensor) else type(labels).__name__
-        raise InvalidArgument(f"labels must be a uint8 tensor [{len(means)}], got {got}", field="labels")
+        description = f"{labels.dtype} {list(labels.shape)}" if isinstance(labels, Tensor) else type(labels).__name__
+        raise InvalidArgument(f"labels must be a uint8 tensor [{len(means)}], got {description}", field="labels")
     if labels.device != means.device:
         raise InvalidArgument(f"labels must be on {means.device} like means, got {labels.device}", field="labels")
-    found = {int(label): f"label {label}" for label in torch.unique(labels).tolist() if label > 0} | dict(known)
-    if not found:
+    names = {int(label): f"label {label}" for label in torch.unique(labels).tolist() if label > 0} | dict(known)
+    if not names:
         raise InvalidArgument("labels must hold one above 0, or info.label_names name one", field="labels")
-    return found
+    return names

@@ -97,22 +97,22 @@ class SceneInfo(Contract):
     @property
     def made_labels(self) -> tuple[int, ...]:
         """Labels of Gaussians that stand for nothing that was recorded."""
-        made = self.provenance.get("made", ())
-        return tuple(label for label in self.label_names if label in made)
+        labels = self.provenance.get("made", ())
+        return tuple(label for label in self.label_names if label in labels)
 
-    def probe_or(self, asked: Probe | None) -> Probe:
+    def probe_or(self, probe: Probe | None) -> Probe:
         """The probe asked for, else the one the scene was trained with.
 
         Raises InvalidProbe where neither is known, and for what is no Probe.
         """
-        if asked is not None and not isinstance(asked, Probe):
-            raise InvalidProbe(f"probe must be a Probe, such as LinearProbe(…), got {asked!r}", field="probe")
-        probe = asked or self.probe
-        if probe is None:
+        if probe is not None and not isinstance(probe, Probe):
+            raise InvalidProbe(f"probe must be a Probe, such as LinearProbe(…), got {probe!r}", field="probe")
+        known_probe = probe or self.probe
+        if known_probe is None:
             raise InvalidProbe(
                 "probe must be given: the scene does not know the one it was trained with", field="probe"
             )
-        return probe
+        return known_probe
 
     def beam_or(self, thickness_mm: float | None) -> ElevationBeam:
         """The beam of the scene, as thick as asked for (None: as it is); where it has none, one without a focus."""
@@ -131,14 +131,14 @@ class SceneInfo(Contract):
 def _label_names(names: Any) -> dict[int, str]:
     """With numbers for keys, which JSON writes as text, in their order."""
     try:
-        found = {int(label): name for label, name in names.items()}
+        by_label = {int(label): name for label, name in names.items()}
     except (AttributeError, TypeError, ValueError):
-        found = {0: ""}
-    if not all(1 <= label <= MAX_LABEL and isinstance(name, str) and name for label, name in found.items()):
+        by_label = {0: ""}
+    if not all(1 <= label <= MAX_LABEL and isinstance(name, str) and name for label, name in by_label.items()):
         raise InvalidArgument(
             f"label_names must give labels from 1 to {MAX_LABEL} a name each, got {names!r}", field="label_names"
         )
-    return dict(sorted(found.items()))
+    return dict(sorted(by_label.items()))
 
 
 def info_to_json(info: SceneInfo) -> str:
@@ -227,8 +227,8 @@ def read_header(path: str | Path) -> SceneHeader:
             check_tissue(info, beside[REST_TENSOR])
             read_model(info.confidence, len(poses))
             if is_compressed:
-                found = bundle.get_tensor(COMPRESSED_TENSOR).tobytes()
-                check_tensor(found, metadata[METADATA_KEY], poses, *beside.values())
+                checksum = bundle.get_tensor(COMPRESSED_TENSOR).tobytes()
+                check_tensor(checksum, metadata[METADATA_KEY], poses, *beside.values())
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
     return SceneHeader(info, poses, size, **beside, moving=moving, is_compressed=is_compressed, text_bytes=text_bytes)

@@ -96,16 +96,16 @@ def read_vector_field(path: str | Path, axes: str | None = None, *, field: str =
     be given. Raises as `read_label_map`, and InvalidArgument where the axes are not known, or given otherwise than the
     file says, and for other transforms than one grid.
     """
-    values, affine, said = _read(path, field, vectors=True)
-    if axes is None and said is None:
+    values, affine, own_axes = _read(path, field, vectors=True)
+    if axes is None and own_axes is None:
         raise InvalidArgument(
             f"{Path(path).name} does not say in which axes its vectors are: {' or '.join(VECTOR_AXES)} must be given "
             "(ITK, ANTs and Slicer write lps)",
             field="field_axes",
         )
-    to_ras = _TO_RAS[axes or said or ""]
-    if said is not None and _TO_RAS[said] != to_ras:
-        raise InvalidArgument(f"{Path(path).name} says that its vectors are {said}, not {axes}", field="field_axes")
+    to_ras = _TO_RAS[axes or own_axes or ""]
+    if own_axes is not None and _TO_RAS[own_axes] != to_ras:
+        raise InvalidArgument(f"{Path(path).name} says that its vectors are {own_axes}, not {axes}", field="field_axes")
     vectors: FloatArray = values.astype(np.float64) * to_ras
     if not np.isfinite(vectors).all():
         raise InvalidArgument(f"{Path(path).name} must hold finite numbers", field=field)

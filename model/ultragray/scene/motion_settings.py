@@ -79,8 +79,8 @@ class MotionSettings(Contract):
         """Raises InvalidArgument unless the mode comes from one place: what is built in, or one of the others."""
         sources = {"chest_mm": self.chest_mm is not None, "pulse_mm": self.pulse_mm is not None, **others}
         if sum(sources.values()) != 1:
-            given = ", ".join(name for name, is_given in sources.items() if is_given) or "none"
-            raise InvalidArgument(f"a mode needs exactly one of {', '.join(sources)}, got {given}", field="chest_mm")
+            names = ", ".join(name for name, is_given in sources.items() if is_given) or "none"
+            raise InvalidArgument(f"a mode needs exactly one of {', '.join(sources)}, got {names}", field="chest_mm")
 
     def check_field(self, *, is_given: bool) -> None:
         """Raises InvalidArgument unless it is told of a field, and of nothing else, which way it leads."""

@@ -53,8 +53,8 @@ class TissueBody(Contract):
     @property
     def acoustics(self) -> Tissue:
         """Those of its tissue, but for what the body says otherwise."""
-        given = {name: getattr(self, name) for name in ("echo_db", "attenuation", "impedance")}
-        return replace(TISSUES[self.tissue], **{name: value for name, value in given.items() if value is not None})
+        overrides = {name: getattr(self, name) for name in ("echo_db", "attenuation", "impedance")}
+        return replace(TISSUES[self.tissue], **{name: value for name, value in overrides.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,9 +116,9 @@ class SceneRecipe(Imaging):
         for name in ("label_map", "ct"):
             if (data := getattr(self, name)) is not None:
                 document[name] = _hash_of(data)
-        for told, body in zip(document["bodies"], self.bodies, strict=True):
+        for description, body in zip(document["bodies"], self.bodies, strict=True):
             if body.shape is not None:
-                told["shape"] = to_dict(body.shape.recorded())
+                description["shape"] = to_dict(body.shape.recorded())
         return {"kind": "from_labels", **document}
 
 
@@ -136,6 +136,6 @@ def read_recipe(path: Path | None, label_map: Path | None, ct: Path | None = Non
         raise InvalidArgument(f"{path or '--tissue'} must be a TOML or JSON file with a list of bodies", field="tissue")
     for name, file in (("label_map", label_map), ("ct", ct)):
         if file is not None:
-            found = MapShape.of_file(file)
-            document |= {name: found["data"], f"{name}_format": found["format"]}
+            content = MapShape.of_file(file)
+            document |= {name: content["data"], f"{name}_format": content["format"]}
     return replace(from_dict(SceneRecipe, document), **others)

@@ -200,11 +200,11 @@ class OfFile:
     @classmethod
     def of_file(cls, path: Path) -> dict[str, str]:
         """The data and the format of a file, by its name. Raises InvalidArgument, OSError."""
-        found = next((one for one in cls.formats if path.name.lower().endswith(f".{one}")), None)
-        if found is None:
+        file_format = next((one for one in cls.formats if path.name.lower().endswith(f".{one}")), None)
+        if file_format is None:
             endings = ", ".join(f".{one}" for one in cls.formats)
             raise InvalidArgument(f"{path} must end in one of {endings}", field="file")
-        return {"data": base64.b64encode(path.read_bytes()).decode("ascii"), "format": found}
+        return {"data": base64.b64encode(path.read_bytes()).decode("ascii"), "format": file_format}
 
 
 @dataclass(frozen=True)
@@ -249,8 +249,8 @@ class MeshShape(OfFile, Shape):
     def distance_mm(self, points: FloatArray) -> FloatArray:
         """From the plane of the surface at its nearest point; the sign is the plane's."""
         index, surface, normals = self._surface
-        found, _ = index.knnSearch(np.ascontiguousarray(points, np.float32), 1, params={"checks": -1})
-        nearest = found[:, 0]
+        indices, _ = index.knnSearch(np.ascontiguousarray(points, np.float32), 1, params={"checks": -1})
+        nearest = indices[:, 0]
         away = points - surface[nearest]
         across = (away * normals[nearest]).sum(axis=1)
         far = np.linalg.norm(away, axis=1)
@@ -289,9 +289,9 @@ class MapShape(OfFile, Shape):
         inside, to_voxels = self._map
         places = np.rint(points @ to_voxels[:3, :3].T + to_voxels[:3, 3]).astype(np.int64)
         known = ((places >= 0) & (places < inside.shape)).all(axis=1)
-        found = np.ones(len(points))
-        found[known] = np.where(inside[tuple(places[known].T)], -1.0, 1.0)
-        return found
+        distances = np.ones(len(points))
+        distances[known] = np.where(inside[tuple(places[known].T)], -1.0, 1.0)
+        return distances
 
     def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
         inside, to_voxels = self._map

@@ -36,7 +36,7 @@ class FollowingTissue:
         self,
         tracked: FloatArray,  # [P, 4, 4] mm, the path of the training frames without the tracker's errors
         at_rest: FloatArray,  # [P, 4, 4] mm
-        errors: FloatArray | None,  # [P, 4, 4] tracked = errors · poses as the tracker told them; None: no errors
+        errors: FloatArray | None,  # [P, 4, 4] tracked = errors · poses as the tracker gives them; None: no errors
         shares: tuple[float, float, float],  # of the motion within the plane (lateral, axial, turn) that tissue sees
         probe: Probe,
     ) -> None:
@@ -44,9 +44,9 @@ class FollowingTissue:
         self._tracked, self._at_rest = _Path(tracked, probe), _Path(at_rest, probe)
         self._sticking = np.zeros(3)
         if errors is not None:
-            told = np.linalg.inv(errors) @ tracked
-            beside = self._tracked.at(*self._tracked.nearest(told))
-            ways = self._ways(beside, told)[:, _WITHIN_THE_PLANE]
+            tracker_poses = np.linalg.inv(errors) @ tracked
+            beside = self._tracked.at(*self._tracked.nearest(tracker_poses))
+            ways = self._ways(beside, tracker_poses)[:, _WITHIN_THE_PLANE]
             self._sticking = STICKING * np.sqrt(np.square(ways).mean(axis=0))
 
     def at_rest(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
@@ -101,8 +101,8 @@ class _Path:
         at_once = max(1, PAIRS_AT_ONCE // len(self._poses))
         for first in range(0, len(poses), at_once):
             some = slice(first, first + at_once)
-            asked = (self._probe.corners_from(poses[some]) - self._centre).reshape(-1, self._corners.shape[1])
-            distances = self._squares - 2.0 * asked @ self._corners.T  # squared, less a number that each pose has
+            corners = (self._probe.corners_from(poses[some]) - self._centre).reshape(-1, self._corners.shape[1])
+            distances = self._squares - 2.0 * corners @ self._corners.T  # squared, less a number that each pose has
             frames[some] = np.argpartition(distances, count - 1, axis=1)[:, :count]
             squares[some] = np.take_along_axis(distances, frames[some], axis=1) / self._corner_count
         squares -= squares.min(axis=1, keepdims=True)

@@ -50,11 +50,11 @@ def plot_distances(evaluations: Mapping[str, Evaluation], distances: Distances) 
 
     The first method is drawn as the scene.
     """
-    shown = {"distance to the nearest training view, mm": distances.mm}
+    panels = {"distance to the nearest training view, mm": distances.mm}
     if np.ptp(distances.deg) > LEAST_TURN_DEG:
-        shown["angle to it, degrees"] = distances.deg
-    drawn, axes = make_figure(len(shown), (11.0, 4.4), columns=len(shown))
-    for axis, (label, away) in zip(axes, shown.items(), strict=True):
+        panels["angle to it, degrees"] = distances.deg
+    drawn, axes = make_figure(len(panels), (11.0, 4.4), columns=len(panels))
+    for axis, (label, away) in zip(axes, panels.items(), strict=True):
         for place, (name, evaluation) in enumerate(evaluations.items()):
             psnr_db = np.array([frame.psnr_db for frame in evaluation.frames])
             axis.plot(*binned_medians(away, psnr_db), marker="o", markersize=3.5, label=name, **line_style(place))
@@ -126,7 +126,7 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
         "distance_plot": plot_distances(scene_first, comparison.distances) if evaluations else None,
         "methods": [{"title": title, "row": one, "short": _short_text(one)} for title, one in by_title.items()],
         "shortened": any(one.cost.is_short for one in comparison.results),
-        "scales": min((found.ms_ssim_scales for found in evaluations.values()), default=5),
+        "scales": min((evaluation.ms_ssim_scales for evaluation in evaluations.values()), default=5),
     }
     return environment("ultragray_studies").get_template("comparison.html").render(values)
 
@@ -143,11 +143,11 @@ def _pictures(
         return []
     telling = next((title for title in evaluations if title == scene), next(iter(evaluations)))
     places = telling_places(evaluations[telling])
-    shown = [
+    columns = [
         Shown.prediction(title, frames_of(folder, by_title[title].name), evaluation, list(places))
         for title, evaluation in evaluations.items()
     ]
-    return frames_of_page(dataset.val.select(list(places)), list(places.values()), shown)
+    return frames_of_page(dataset.val.select(list(places)), list(places.values()), columns)
 
 
 def _facts(comparison: Comparison) -> dict[str, str]:

@@ -42,7 +42,7 @@ class MethodResult:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object. The scores of frames hold the speckle of each too, which its means are made of."""
-        found = self.evaluation
+        evaluation = self.evaluation
         return {
             "name": self.name,
             "title": self.title,
@@ -50,7 +50,8 @@ class MethodResult:
             "machine": self.machine,
             **asdict(self.cost),
             "frame_ms": self.frame_ms,
-            "evaluation": found and {**found.to_dict(), "frame_speckle": [asdict(one) for one in found.frame_speckle]},
+            "evaluation": evaluation
+            and {**evaluation.to_dict(), "frame_speckle": [asdict(one) for one in evaluation.frame_speckle]},
             "on_path": self.on_path and self.on_path.to_dict(),
             "failure": self.failure,
         }
@@ -58,19 +59,19 @@ class MethodResult:
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> MethodResult:
         """Inverse of `to_dict`. Raises LookupError, TypeError or ValueError for what is none."""
-        found = document["evaluation"]
+        evaluation = document["evaluation"]
         return cls(
             name=document["name"],
             description=_DESCRIPTION.validate_python(document["description"]),
             machine=document["machine"],
             cost=_COST.validate_python(document),
             frame_ms=document["frame_ms"],
-            evaluation=found
+            evaluation=evaluation
             and Evaluation(
-                _METRICS.validate_python(found["frames"]),
-                np.array([frame["frame"] for frame in found["frames"]], np.int64),
-                found["ms_ssim_scales"],
-                _SPECKLE.validate_python(found["frame_speckle"]),
+                _METRICS.validate_python(evaluation["frames"]),
+                np.array([frame["frame"] for frame in evaluation["frames"]], np.int64),
+                evaluation["ms_ssim_scales"],
+                _SPECKLE.validate_python(evaluation["frame_speckle"]),
             ),
             on_path=None if document.get("on_path") is None else _MEAN.validate_python(document["on_path"]),
             failure=document["failure"],

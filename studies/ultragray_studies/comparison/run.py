@@ -55,16 +55,16 @@ class Place:
             self.keep_budget(None)
             return
         try:
-            found = dict(json.loads(path.read_text(encoding="utf-8")))
+            document = dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, TypeError) as error:
             raise TrainingStateInvalid(f"{path}: not the state of a comparison: {error}") from error
         for name, value in comparison.items():
-            if found.get(name) != value:
+            if document.get(name) != value:
                 raise TrainingStateInvalid(
-                    f"{folder}: it holds a comparison with {name} {found.get(name)}, this one has {value}; "
+                    f"{folder}: it holds a comparison with {name} {document.get(name)}, this one has {value}; "
                     "give another folder"
                 )
-        self.budget_s = found.get("budget_s")
+        self.budget_s = document.get("budget_s")
 
     def keep_budget(self, seconds: float | None) -> None:
         """Keep the equal time beside which comparison it is."""
@@ -130,7 +130,7 @@ def compare_methods(
     paces = default_paces(dataset, device) if paces is None else paces
     shared: dict[str, Any] = {"budget": settings.budget, "times": settings.times, "seed": settings.seed}
     place = Place(folder, format_version=FORMAT_VERSION, dataset=dataset.sha256, **shared)
-    kind, asked = BudgetKind(settings.budget), set(methods)
+    kind, names = BudgetKind(settings.budget), set(methods)
     needs_time = kind is BudgetKind.EQUAL and any(map(_learns_within_a_time, methods.values()))
     seconds = place.budget_s
     if needs_time:
@@ -163,7 +163,7 @@ def compare_methods(
             paces.keep(EQUAL_TIME, Pace(seconds, 0.0))
         if needs_time and seconds != place.budget_s:
             place.keep_budget(seconds)
-        if name in asked:  # the scene may have been fitted for its time only
+        if name in names:  # the scene may have been fitted for its time only
             results.append(result)
     return Comparison(
         dataset=DatasetFacts.of(dataset),

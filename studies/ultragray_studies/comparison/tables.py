@@ -12,8 +12,8 @@ COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
 
 def path_texts(comparison: Comparison, result: MethodResult) -> list[str]:
     """The PSNR on the path that neighbours agree with: one text where the comparison has it of some method."""
-    found = result.on_path
-    return ["–" if found is None else shown_value("psnr_db", found.psnr_db)] if comparison.has_path else []
+    metrics = result.on_path
+    return ["–" if metrics is None else shown_value("psnr_db", metrics.psnr_db)] if comparison.has_path else []
 
 
 def cost_texts(result: MethodResult) -> list[str]:

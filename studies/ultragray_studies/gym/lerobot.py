@@ -197,8 +197,8 @@ def _task_table(tasks: Sequence[str]) -> Any:
         }
         for name, kind in kinds.items()
     ]
-    told = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
-    return table.replace_schema_metadata({"pandas": json.dumps(told)})
+    metadata = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    return table.replace_schema_metadata({"pandas": json.dumps(metadata)})
 
 
 def _episode_table(episodes: Sequence[Episode], ends: npt.NDArray[np.int64]) -> Any:
@@ -246,12 +246,12 @@ def read_lerobot(folder: Path) -> list[Episode]:
     except (OSError, ValueError) as error:
         raise InvalidArgument(f"{folder} holds no LeRobot data set: {error}", field="folder") from None
     if info.get("codebase_version") != VERSION:
-        told = info.get("codebase_version")
-        raise InvalidArgument(f"a LeRobot data set must be of version {VERSION}, got {told!r}", field="folder")
+        version = info.get("codebase_version")
+        raise InvalidArgument(f"a LeRobot data set must be of version {VERSION}, got {version!r}", field="folder")
     wanted = {IMAGE: "image", STATE: "float32", ACTION: "float32", REWARD: "float32", DONE: "bool"}
     for name, kind in wanted.items():
-        if (got := info["features"].get(name, {}).get("dtype")) != kind:
-            raise InvalidArgument(f"the feature {name} must be {kind}, got {got}", field="folder")
+        if (dtype := info["features"].get(name, {}).get("dtype")) != kind:
+            raise InvalidArgument(f"the feature {name} must be {kind}, got {dtype}", field="folder")
     tasks = {row["task_index"]: row["task"] for row in parquet.read_table(folder / "meta/tasks.parquet").to_pylist()}
     table = pyarrow.concat_tables(parquet.read_table(path) for path in sorted((folder / "data").glob("*/*.parquet")))
     numbers = table["episode_index"].to_numpy()

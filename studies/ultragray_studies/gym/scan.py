@@ -155,7 +155,7 @@ class Site:
             plain = self._plain_look(poses, contact, watched)
             if plain is not None:
                 return plain
-        shown: dict[str, Any] = {
+        options: dict[str, Any] = {
             "height": settings.height,
             "width": settings.width,
             "outputs": ("bmode", "coverage") if watched else ("bmode",),
@@ -164,11 +164,11 @@ class Site:
         with torch.no_grad():
             if any(tools):
                 each = [
-                    render(self.scene, self.probe, one, tools=own, **shown)
+                    render(self.scene, self.probe, one, tools=own, **options)
                     for one, own in zip(poses, tools, strict=True)
                 ]
             else:
-                each = [render(self.scene, self.probe, poses, **shown)]
+                each = [render(self.scene, self.probe, poses, **options)]
             bmode = _together([frames["bmode"] for frames in each])
             lines = np.ones((len(poses), settings.width), np.bool_)
             if contact is not None:
@@ -176,12 +176,12 @@ class Site:
             confidences = None
             if watched:
                 coverage = _together([frames["coverage"] for frames in each])
-                found = self._judged(poses, supported_shares(coverage).tolist())
+                extrapolations = self._judged(poses, supported_shares(coverage).tolist())
                 if masked:
                     least = settings.min_confidence or 0.0
-                    low = torch.tensor([not is_confident(one, least) for one in found], device=bmode.device)
+                    low = torch.tensor([not is_confident(one, least) for one in extrapolations], device=bmode.device)
                     bmode.masked_fill_(low[:, None, None] & (coverage < SUPPORT_COVERAGE), 0.0)
-                confidences = _confidences(found)
+                confidences = _confidences(extrapolations)
         return View(poses, _grey(bmode), lines, confidences)
 
     def _plain_look(self, poses: FloatArray, contact: Contact | None, watched: bool) -> View | None:  # [K, 4, 4]
@@ -192,8 +192,8 @@ class Site:
         if grey is None:
             return None
         lines = np.ones((len(poses), size[1]), np.bool_) if touch is None else touch.lines
-        found = _confidences(self._judged(poses, grey.supported.tolist())) if watched else None
-        return View(poses, grey.bmode, lines, found)
+        confidences = _confidences(self._judged(poses, grey.supported.tolist())) if watched else None
+        return View(poses, grey.bmode, lines, confidences)
 
     def _judged(self, poses: FloatArray, shares: list[float]) -> list[Extrapolation]:  # [K, 4, 4], [K] -> [K]
         """How far frames, of whose pixels such shares have support, are from what the scene was trained on."""
@@ -248,13 +248,13 @@ class Site:
             raise InvalidArgument(
                 f"label must be a name that the scene gives its Gaussians ({known}), got {label!r}", field="label"
             )
-        found: FloatArray = points[scene.labels.cpu().numpy() == numbers[0]]
-        return found
+        chosen_points: FloatArray = points[scene.labels.cpu().numpy() == numbers[0]]
+        return chosen_points
 
 
-def _confidences(found: Sequence[Extrapolation]) -> FloatArray:  # [K]
+def _confidences(extrapolations: Sequence[Extrapolation]) -> FloatArray:  # [K]
     """0 where it is unknown."""
-    return np.array([one.confidence or 0.0 for one in found])
+    return np.array([one.confidence or 0.0 for one in extrapolations])
 
 
 def _together(parts: Sequence[Tensor]) -> Tensor:
@@ -287,5 +287,5 @@ def goal_of(scene: GaussianScene, goal: Any) -> FloatArray:  # [4, 4]
         raise InvalidArgument(
             f"goal must be a pose, or the number of a training view, 0 to {len(views) - 1}, got {number}", field="goal"
         )
-    found: FloatArray = views[number].copy()
-    return found
+    view: FloatArray = views[number].copy()
+    return view

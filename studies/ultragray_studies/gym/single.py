@@ -40,23 +40,23 @@ class UltragrayEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         super().reset(seed=seed)
         self._only.randoms[0] = self.np_random
         observations, infos = self._only.reset(options=None if options is None else dict(options))
-        return _first(observations), _told(infos)
+        return _first(observations), _info(infos)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Moves the probe. Raises InvalidArgument for an action that is not as many finite numbers as it should be."""
         try:
-            given = np.asarray(action, np.float64)[None]
+            actions = np.asarray(action, np.float64)[None]
         except (TypeError, ValueError):
             raise InvalidArgument(
                 f"an action must be finite numbers from -1 to 1, got {action!r}", field="action"
             ) from None
-        observations, rewards, terminated, _, infos = self._only.step(given)
-        return _first(observations), float(rewards[0]), bool(terminated[0]), False, _told(infos)
+        observations, rewards, terminated, _, infos = self._only.step(actions)
+        return _first(observations), float(rewards[0]), bool(terminated[0]), False, _info(infos)
 
     def render(self) -> Any:
         """The frame, and beside it that of the goal where there is one, [H, 2·W, 3]."""
-        shown = self._only.render()
-        return None if shown is None else shown[0]
+        pictures = self._only.render()
+        return None if pictures is None else pictures[0]
 
 
 def _first(observations: Any) -> Any:
@@ -65,7 +65,7 @@ def _first(observations: Any) -> Any:
     return observations[0]
 
 
-def _told(infos: Mapping[str, Any]) -> dict[str, Any]:
+def _info(infos: Mapping[str, Any]) -> dict[str, Any]:
     """What the vector environment tells of its only one, plain numbers where it is one."""
     own = {name: values[0] for name, values in infos.items() if not name.startswith("_")}
     return {name: value if value.ndim else value.item() for name, value in own.items()}

@@ -38,7 +38,7 @@ class Judgement:
 
     rewards: Tensor  # [K], where the frames are
     is_done: BoolArray  # [K]
-    told: dict[str, Any] = field(default_factory=dict)  # [K, ...] each, beside what every task tells
+    infos: dict[str, Any] = field(default_factory=dict)  # [K, ...] each, beside what every task tells
 
 
 class Task:
@@ -124,9 +124,9 @@ def _correlations(rows: Any, part: Any) -> Any:  # [K, pixels], [pixels] of mean
     Of arrays, and of tensors.
     """
     squares, means = (rows * rows).sum(axis=1), rows.mean(axis=1)
-    left = squares - rows.shape[1] * means * means
-    found = (rows @ part) / left.clip(min=1e-30) ** 0.5 * (left > LEAST_CONTRAST * squares)
-    return found.clip(-1.0, 1.0)  # rounding could take it beyond
+    variances = squares - rows.shape[1] * means * means
+    correlations = (rows @ part) / variances.clip(min=1e-30) ** 0.5 * (variances > LEAST_CONTRAST * squares)
+    return correlations.clip(-1.0, 1.0)  # rounding could take it beyond
 
 
 class StandardPlane(Task):
@@ -319,5 +319,5 @@ class NeedleReach(Task):
         before = np.where(np.isnan(self._away_mm[which]), away_mm, self._away_mm[which])
         self._away_mm[which] = away_mm
         nearer = _tensor((before - away_mm) / self.site.settings.step_mm, view.frames)
-        told = {"tip_mm": away_mm, "needle_mm": self._depths_mm[which].copy()}
-        return Judgement(nearer + _contact_of(view), away_mm <= self.site.settings.reached_mm, told)
+        infos = {"tip_mm": away_mm, "needle_mm": self._depths_mm[which].copy()}
+        return Judgement(nearer + _contact_of(view), away_mm <= self.site.settings.reached_mm, infos)

@@ -70,10 +70,10 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
         self.settings = ScanSettings(**settings)
         self._mode, self._most_steps, self._as_numpy = AutoresetMode(autoreset_mode), max_episode_steps, as_numpy
         self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": 25, "autoreset_mode": self._mode}
-        given = [scene] if isinstance(scene, (GaussianScene, str, Path)) else list(scene)
-        if not given:
+        sources = [scene] if isinstance(scene, (GaussianScene, str, Path)) else list(scene)
+        if not sources:
             raise InvalidArgument("scene must be a scene, its file, or some of them, got none", field="scene")
-        scenes = [one if isinstance(one, GaussianScene) else GaussianScene.load(one) for one in given]
+        scenes = [one if isinstance(one, GaussianScene) else GaussianScene.load(one) for one in sources]
         if len({one.means.device for one in scenes}) > 1:
             raise InvalidArgument("scenes must be on one device, which their frames stay on", field="scene")
         self._device = scenes[0].means.device
@@ -124,17 +124,17 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
             for number, own in enumerate(seeds):
                 if own is not None:
                     self.randoms[number] = gymnasium.utils.seeding.np_random(own)[0]
-        given = dict(options or {})
-        poses, mask = given.pop("pose", None), given.pop("reset_mask", None)
-        if given:
+        rest = dict(options or {})
+        poses, mask = rest.pop("pose", None), rest.pop("reset_mask", None)
+        if rest:
             raise InvalidArgument(
-                f"options may hold pose and reset_mask, got {', '.join(map(str, given))}", field="options"
+                f"options may hold pose and reset_mask, got {', '.join(map(str, rest))}", field="options"
             )
         which = self._mask(mask)
         checked = None if poses is None else self._checked_starts(poses)
         self._begin(which, checked)
         _, _, infos = self._look(which)
-        return self._observed(), self._told(infos, which)
+        return self._observed(), self._infos(infos, which)
 
     def _mask(self, mask: Any) -> BoolArray:  # [N]
         if mask is None:
@@ -183,38 +183,38 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
         terminated &= ~fresh
         truncated = np.zeros_like(terminated) if self._most_steps is None else self._steps >= self._most_steps
         self._ended = terminated | truncated
-        told = self._told(infos, everywhere)
+        masked_infos = self._infos(infos, everywhere)
         if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
-            ended, final, ending = self._ended.copy(), self._observed(), self._told(infos, self._ended)
+            ended, final, ending = self._ended.copy(), self._observed(), self._infos(infos, self._ended)
             self._begin(ended, None)
-            _, _, begun = self._look(ended)
-            told = {
-                **self._told({name: _replaced(infos[name], ended, begun[name]) for name in infos}, everywhere),
+            _, _, new_infos = self._look(ended)
+            masked_infos = {
+                **self._infos({name: _replaced(infos[name], ended, new_infos[name]) for name in infos}, everywhere),
                 **{"final_obs": final, "_final_obs": ended, "final_info": ending, "_final_info": ended},
             }
-        return self._observed(), self._out(rewards), self._out(terminated), self._out(truncated), told
+        return self._observed(), self._out(rewards), self._out(terminated), self._out(truncated), masked_infos
 
     def render(self) -> tuple[Any, ...] | None:
         """Of each environment the frame, and where its task is a standard plane beside it that of the goal, RGB."""
         if self.render_mode is None:
             return None
-        shown = []
+        pictures = []
         for number, frame in enumerate(self._frames.cpu().numpy()):
             task = self.tasks[number % len(self.tasks)]
             parts = [frame, *([task.frame.cpu().numpy()] if isinstance(task, StandardPlane) else [])]
-            shown.append(np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=2))
-        return tuple(shown)
+            pictures.append(np.repeat(np.concatenate(parts, axis=1)[..., None], 3, axis=2))
+        return tuple(pictures)
 
     def _begin(self, which: BoolArray, poses: FloatArray | None) -> None:  # [N], [N, 4, 4]
         for task, own in zip(self.tasks, self._members, strict=True):
             mask = which[own]
             if mask.any():
-                begun = own[mask]
+                numbers = own[mask]
                 if poses is None:
-                    randoms = [self.randoms[number] for number in begun]
-                    self._poses[begun] = task.site.random_starts(task.posts[0], randoms)
+                    randoms = [self.randoms[number] for number in numbers]
+                    self._poses[numbers] = task.site.random_starts(task.posts[0], randoms)
                 else:
-                    self._poses[begun] = poses[begun]
+                    self._poses[numbers] = poses[numbers]
                 task.begin(mask)
         self._starts[which], self._steps[which], self._ended[which] = self._poses[which], 0, False
 
@@ -222,9 +222,9 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
         for task, own in zip(self.tasks, self._members, strict=True):
             pivot_mm = task.site.probe.pivot_depth_mm
             shifts, turns = actions[own, :3] * self.settings.step_mm, actions[own, 3:6] * self.settings.step_deg
-            asked = moved(self._poses[own], shifts, turns, pivot_mm)
-            allowed = which[own] & self._in_reach_of(task, asked)[0]
-            self._poses[own[allowed]] = check_poses(asked[allowed])  # rounding does not add up
+            new_poses = moved(self._poses[own], shifts, turns, pivot_mm)
+            allowed = which[own] & self._in_reach_of(task, new_poses)[0]
+            self._poses[own[allowed]] = check_poses(new_poses[allowed])  # rounding does not add up
             task.act(which[own], actions[own, 6:])
 
     def _in_reach(self, poses: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:  # [N, 4, 4] -> [N] each
@@ -256,16 +256,16 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
             whole = len(at) == self.num_envs
             self._frames = view.frames if whole else self._frames.index_copy(0, at, view.frames)
             away_mm, turned_deg = (values[:, 0] for values in task.site.between(poses, task.goal[None]))
-            told = {"contact_share": view.contact_shares, "distance_mm": away_mm, "angle_deg": turned_deg}
+            figures = {"contact_share": view.contact_shares, "distance_mm": away_mm, "angle_deg": turned_deg}
             worth = judged.rewards
             if view.confidences is not None:
-                told["confidence"] = view.confidences
+                figures["confidence"] = view.confidences
                 if self.settings.low_confidence is LowConfidence.PENALTY:
                     least = self.settings.min_confidence
                     lack = np.maximum(1.0 - view.confidences / least, 0.0) if least else np.zeros(len(places))
                     worth = worth - torch.from_numpy(lack).float().to(self._device)
             rewards[at], done[places] = worth, judged.is_done
-            for name, values in {**told, **judged.told, "pose": poses}.items():
+            for name, values in {**figures, **judged.infos, "pose": poses}.items():
                 if name not in infos:
                     empty = values.new_zeros if isinstance(values, Tensor) else np.zeros
                     infos[name] = empty((self.num_envs, *values.shape[1:]))
@@ -288,10 +288,10 @@ class UltragrayVectorEnv(VectorEnv[Any, Any, Any]):
             return values.cpu().numpy() if isinstance(values, Tensor) else values
         return values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
 
-    def _told(self, infos: Mapping[str, Any], which: BoolArray) -> dict[str, Any]:
+    def _infos(self, infos: Mapping[str, Any], which: BoolArray) -> dict[str, Any]:
         """Infos as gymnasium has them: beside each value a mask of the environments that it is of."""
-        given = {name: self._out(values) if isinstance(values, Tensor) else values for name, values in infos.items()}
-        return {**given, **{f"_{name}": which.copy() for name in given}}
+        arrays = {name: self._out(values) if isinstance(values, Tensor) else values for name, values in infos.items()}
+        return {**arrays, **{f"_{name}": which.copy() for name in arrays}}
 
 
 def _replaced(values: Any, which: BoolArray, others: Any) -> Any:  # [N, ...], [N], [N, ...]
@@ -303,11 +303,11 @@ def _replaced(values: Any, which: BoolArray, others: Any) -> Any:  # [N, ...], [
 def _finite(actions: Any, shape: tuple[int, int]) -> FloatArray:
     """Raises InvalidArgument."""
     try:
-        given = np.asarray(actions.detach().cpu() if isinstance(actions, Tensor) else actions, np.float64)
+        array = np.asarray(actions.detach().cpu() if isinstance(actions, Tensor) else actions, np.float64)
     except (TypeError, ValueError):
-        given = np.zeros(0)
-    if given.shape != shape or not np.isfinite(given).all():
+        array = np.zeros(0)
+    if array.shape != shape or not np.isfinite(array).all():
         raise InvalidArgument(
             f"actions must be {shape[0]} times {shape[1]} finite numbers from -1 to 1, got {actions!r}", field="action"
         )
-    return given
+    return array

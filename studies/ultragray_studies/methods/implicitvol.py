@@ -32,8 +32,8 @@ class SineLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:  # [..., inputs] -> [..., outputs]
         # The frequency goes to the weights, of which there are fewer than values.
-        found: Tensor = functional.linear(x, self.frequency * self.weight, self.frequency * self.bias).sin()
-        return found
+        values: Tensor = functional.linear(x, self.frequency * self.weight, self.frequency * self.bias).sin()
+        return values
 
 
 class SineField(nn.Module):
@@ -65,8 +65,8 @@ class SineField(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:  # [..., 3] -> [...]
         encoded = encode(points)
-        found = self.far(torch.cat([self.near(encoded), encoded], dim=-1))
-        value: Tensor = self.last(self.narrow(self.middle(found)))
+        features = self.far(torch.cat([self.near(encoded), encoded], dim=-1))
+        value: Tensor = self.last(self.narrow(self.middle(features)))
         return value.squeeze(-1)
 
 

@@ -100,11 +100,11 @@ class Learner:
 
     def state(self) -> dict[str, Tensor]:
         """What the next step depends on."""
-        found = {f"model.{name}": tensor for name, tensor in self.model().items()}
+        tensors = {f"model.{name}": tensor for name, tensor in self.model().items()}
         for name, optimizer in self.optimizers.items():
             for place, of in optimizer.state_dict()["state"].items():
-                found |= {f"optimizer.{name}.{place}.{key}": torch.as_tensor(value) for key, value in of.items()}
-        return {**found, "generator": self.generator.get_state()}
+                tensors |= {f"optimizer.{name}.{place}.{key}": torch.as_tensor(value) for key, value in of.items()}
+        return {**tensors, "generator": self.generator.get_state()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Inverse of `state`. Raises KeyError, RuntimeError or ValueError where that is another learner's."""
@@ -186,14 +186,14 @@ class LearnedMethod(Method):
                 saved_at = time.monotonic()
             if stop:
                 return None
-        shown = budget.shown_pace(self.name, steps, elapsed_s)
+        pace = budget.shown_pace(self.name, steps, elapsed_s)
         model = learner.model()
-        if shown is None and saved.folder is not None and not (saved.folder / MODEL_FILE).exists():
+        if pace is None and saved.folder is not None and not (saved.folder / MODEL_FILE).exists():
             saved.write(MODEL_FILE, model, steps, steps, elapsed_s)
         if saved.folder is not None:  # the model is in its place, or the fit begins anew
             (saved.folder / STATE_FILE).unlink(missing_ok=True)
-        if shown is not None:
-            budget.paces.keep(self.name, shown)
+        if pace is not None:
+            budget.paces.keep(self.name, pace)
             return self._fit(dataset, budget, run, device)
         budget.paces.confirm(self.name)
         size = sum(tensor.numel() * tensor.element_size() for tensor in model.values())

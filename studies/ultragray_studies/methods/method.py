@@ -117,8 +117,8 @@ class Budget:
         if pace is None or pace.is_confirmed:
             return None
         assert self.seconds is not None
-        shown = Pace(pace.start_s, (seconds - pace.start_s) / steps, is_confirmed=False)
-        return shown if seconds < USED_SHARE * self.seconds and 0.0 < shown.step_s < pace.step_s else None
+        new_pace = Pace(pace.start_s, (seconds - pace.start_s) / steps, is_confirmed=False)
+        return new_pace if seconds < USED_SHARE * self.seconds and 0.0 < new_pace.step_s < pace.step_s else None
 
 
 # The protocol of a method: it is fitted to a sweep within a budget, and what was fitted predicts frames. All methods

@@ -41,8 +41,8 @@ class Box:
 def pixel_points_mm(probe: Probe, pose: FloatArray, height: int, width: int) -> FloatArray:  # [H, W, 3]
     """The place of each pixel in the tracker's frame, mm, of a frame at a pose [4, 4]."""
     points = pixel_positions_mm(probe, height, width) @ pose[:3, :3].T + pose[:3, 3]
-    found: FloatArray = points.reshape(height, width, 3)
-    return found
+    pixel_points: FloatArray = points.reshape(height, width, 3)
+    return pixel_points
 
 
 def as_tensor(array: FloatArray, device: torch.device) -> Tensor:
@@ -92,14 +92,14 @@ class Similarity:
     def ms_ssim(self, x: Tensor, y: Tensor) -> Tensor:  # [C, H, W] both -> scalar
         """The mean over the images of MS-SSIM on as many scales as hold a window, their weights adding to 1."""
         x, y = x[:, None], y[:, None]
-        held = 1
-        while held < len(SCALE_WEIGHTS) and min(x.shape[-2:]) // 2**held >= self.window:
-            held += 1
-        weights = torch.tensor(SCALE_WEIGHTS[:held], dtype=x.dtype, device=x.device)
+        count = 1
+        while count < len(SCALE_WEIGHTS) and min(x.shape[-2:]) // 2**count >= self.window:
+            count += 1
+        weights = torch.tensor(SCALE_WEIGHTS[:count], dtype=x.dtype, device=x.device)
         factors = []
-        for scale in range(held):
+        for scale in range(count):
             luminance, contrast = self._maps(x, y)
-            coarsest = scale == held - 1
+            coarsest = scale == count - 1
             factors.append((luminance * contrast if coarsest else contrast).mean(dim=(1, 2, 3)).clamp_min(1e-6))
             x, y = functional.avg_pool2d(x, 2), functional.avg_pool2d(y, 2)
         return (torch.stack(factors, dim=1) ** (weights / weights.sum())).prod(dim=1).mean()
@@ -181,8 +181,8 @@ class SliceLearner(Learner):
     def loss(self, step: int, steps: int) -> Tensor:
         self.set_rates(step, steps)
         place = frame_of_step(step, len(self.images), self.seed)
-        found = self.field(self.training_points(place))
-        return 1.0 - SIMILARITY.ssim(found[None], self.image(place)[None])
+        frame = self.field(self.training_points(place))
+        return 1.0 - SIMILARITY.ssim(frame[None], self.image(place)[None])
 
     def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
         points = self.rendered_points(self.pixels_of(probe, height, width), pose)

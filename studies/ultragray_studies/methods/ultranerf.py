@@ -159,8 +159,8 @@ class Coordinates:
         return cls(box.centre_mm, box.largest_half_mm)
 
     def of(self, points_mm: FloatArray) -> FloatArray:  # [..., 3] -> [..., 3]
-        found: FloatArray = (points_mm - self.origin_mm) / self.unit_mm
-        return found
+        coordinates: FloatArray = (points_mm - self.origin_mm) / self.unit_mm
+        return coordinates
 
 
 class UltraNerfLearner(Learner):

@@ -28,14 +28,14 @@ class NpzExporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        self._file = self._held.enter_context(StreamedFile(self._path))
-        self._archive = self._held.enter_context(zipfile.ZipFile(self._file, "w"))  # type: ignore[call-overload]
+        self._file = self._stack.enter_context(StreamedFile(self._path))
+        self._archive = self._stack.enter_context(zipfile.ZipFile(self._file, "w"))  # type: ignore[call-overload]
         first, *others = header.settings.outputs
         self._waiting: dict[str, IO[bytes]] = {
-            name: self._held.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
+            name: self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
             for name in others
         }
-        self._first = self._held.enter_context(self._member(first))
+        self._first = self._stack.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}
         for name, file in self._files.items():
             described = {"descr": header.pixel_type(name).str, "fortran_order": False, "shape": header.shape}
@@ -69,8 +69,8 @@ class TarExporter(Exporter):
     """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
 
     def _open(self) -> None:
-        self._file = self._held.enter_context(StreamedFile(self._path))
-        self._tar = self._held.enter_context(tarfile.TarFile(mode="w", fileobj=self._file))  # type: ignore[arg-type]
+        self._file = self._stack.enter_context(StreamedFile(self._path))
+        self._tar = self._stack.enter_context(tarfile.TarFile(mode="w", fileobj=self._file))  # type: ignore[arg-type]
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         for place in range(count):

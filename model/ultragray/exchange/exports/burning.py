@@ -30,11 +30,11 @@ class AnnotatedPictures:
 
     def __init__(self, picture: Picture, annotations: Sequence[Annotation]) -> None:
         """Raises InvalidArgument for what is no PNG file, a large or a tall one, or more than MAX_PIXELS."""
-        left = MAX_PIXELS
+        rest = MAX_PIXELS
         self._over: list[tuple[int, Image.Image]] = []
         for place, one in enumerate(annotations):
-            self._over.append((one.frame, _decoded(one, f"annotations[{place}].picture", left)))
-            left -= math.prod(self._over[-1][1].size)
+            self._over.append((one.frame, _decoded(one, f"annotations[{place}].picture", rest)))
+            rest -= math.prod(self._over[-1][1].size)
         across, down = picture.step
         enlarged = [round(one.width / picture.width) for _, one in self._over]
         k = self._enlarged = min(MAX_ENLARGED, max([1, *enlarged]))

@@ -56,7 +56,7 @@ class DicomExporter(Exporter):
                 f"{header.settings.picture.height}x{header.settings.picture.width} are {self._bytes:,}",
                 field="format",
             )
-        self._file = self._held.enter_context(self._path.open("wb"))
+        self._file = self._stack.enter_context(self._path.open("wb"))
         self._data_set().save_as(self._file, enforce_file_format=True)
         padded = self._bytes + self._bytes % 2
         self._file.write(struct.pack("<HH2sHI", 0x7FE0, 0x0010, b"OB", 0, padded))  # PixelData

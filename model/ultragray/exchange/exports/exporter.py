@@ -76,19 +76,19 @@ class Exporter(ABC):
     """Writer of one format: takes the frames in order, in portions; only `close` makes the file whole.
 
     Portions are arrays [B, H, W] by output, already of their pixel type (`stored_pixels`). A subclass keeps what must
-    be released in `_held`.
+    be released in `_stack`.
     """
 
     def __init__(self, path: Path, header: ExportHeader) -> None:
         """Open the file. Raises InvalidArgument for frames that the format cannot hold, OSError."""
         self._path, self._header, self._done = path, header, 0
         self._extrapolations: list[Extrapolation] = []  # of the frames that are there
-        self._held = ExitStack()
+        self._stack = ExitStack()
         self.sha256: str | None = None  # of the whole file, where a subclass has hashed it on the way
         try:
             self._open()
         except BaseException:
-            self._held.close()
+            self._stack.close()
             raise
 
     def add(self, frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
@@ -108,12 +108,12 @@ class Exporter(ABC):
                 )
             self._finish()
         finally:
-            self._held.close()
+            self._stack.close()
 
     def abandon(self) -> None:
         """Release the file, which is worth nothing; instead of `close`, where the frames end too early."""
         with suppress(Exception):  # on a full disk, closing fails as writing did
-            self._held.close()
+            self._stack.close()
 
     def _figures(self) -> dict[str, npt.NDArray[np.float32]]:
         """The figures of all frames by name, [C]; NaN where one is not known, or the frame is still to come."""

@@ -148,8 +148,8 @@ def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
     if dtype is not None and dtype not in chosen.dtypes:
         raise InvalidArgument(f"dtype must be {chosen.dtypes[0]} in format {name}, got {dtype}", field="dtype")
     if chosen.bmode_only and tuple(outputs) != ("bmode",):
-        given = ", ".join(outputs)
-        raise InvalidArgument(f"outputs must be bmode alone in format {name}, got {given}", field="outputs")
+        names = ", ".join(outputs)
+        raise InvalidArgument(f"outputs must be bmode alone in format {name}, got {names}", field="outputs")
     return dtype or chosen.dtypes[0]
 
 

@@ -19,8 +19,8 @@ class Hdf5Exporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        self._sink = self._held.enter_context(_Sink(str(self._path), "r+"))
-        self._hdf5 = file = self._held.enter_context(h5py.File(self._sink, "w"))
+        self._sink = self._stack.enter_context(_Sink(str(self._path), "r+"))
+        self._hdf5 = file = self._stack.enter_context(h5py.File(self._sink, "w"))
         origin = header.origin()
         file.attrs.update({name: one if isinstance(one, str) else json.dumps(one) for name, one in origin.items()})
         file.create_dataset("poses", data=np.asarray(header.poses, np.float64))

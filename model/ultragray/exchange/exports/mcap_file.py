@@ -13,7 +13,7 @@ class McapExporter(Exporter):
     """A writer of the topics of `RosRecording`, 25 frames a second from time 0."""
 
     def _open(self) -> None:
-        self._recording = RosRecording(self._held.enter_context(self._path.open("wb")))
+        self._recording = RosRecording(self._stack.enter_context(self._path.open("wb")))
         self._origin = self._header.origin()
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:

@@ -27,12 +27,12 @@ class ParquetExporter(Exporter):
             **{name: (pyarrow.float32(), _value("float32")) for name in self._figures()},
         }
         features = {name: feature for name, (_, feature) in columns.items()}
-        told = {"huggingface": {"info": {"features": features}}, "ultragray": self._header.origin()}
+        metadata = {"huggingface": {"info": {"features": features}}, "ultragray": self._header.origin()}
         types = [(name, kind) for name, (kind, _) in columns.items()]
-        self._schema = pyarrow.schema(types, {name: json.dumps(document) for name, document in told.items()})
-        file = self._held.enter_context(self._path.open("wb"))
+        self._schema = pyarrow.schema(types, {name: json.dumps(document) for name, document in metadata.items()})
+        file = self._stack.enter_context(self._path.open("wb"))
         # PNG files are compressed already.
-        self._writer = self._held.enter_context(pyarrow.parquet.ParquetWriter(file, self._schema, compression="none"))
+        self._writer = self._stack.enter_context(pyarrow.parquet.ParquetWriter(file, self._schema, compression="none"))
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         first, header = self._done, self._header

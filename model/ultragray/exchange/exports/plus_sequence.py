@@ -33,7 +33,7 @@ class PlusExporter(Exporter):
     """A writer of the whole header at once, then of the pixels, and of the figures over their place in the header."""
 
     def _open(self) -> None:
-        self._file = self._held.enter_context(self._path.open("wb"))
+        self._file = self._stack.enter_context(self._path.open("wb"))
         self._write_header()
 
     def _write_header(self) -> None:

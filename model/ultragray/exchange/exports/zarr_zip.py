@@ -19,7 +19,7 @@ class ZarrExporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        store = self._held.enter_context(ZipStore(self._path, mode="w"))
+        store = self._stack.enter_context(ZipStore(self._path, mode="w"))
         self._group = group = zarr.create_group(store, attributes=header.origin())
         self._store_whole("poses", np.asarray(header.poses, np.float64))
         self._arrays = {

@@ -51,14 +51,14 @@ def edit_scene(
     Raises InvalidArgument, naming the edit and its field.
     """
     check_edits(edits)
-    given = {"scene": scene, **(others or {})}
-    parents = dict(names or {}) or {name: digest(one) for name, one in given.items()}
+    scenes = {"scene": scene, **(others or {})}
+    parents = dict(names or {}) or {name: digest(one) for name, one in scenes.items()}
     edited, recorded = scene, []
     for index, edit in enumerate(edits):
         is_moving = edited.moving is not None
         with under(f"edits[{index}]"):
             edited, done = _edited(edited, edit, others or {})
-        is_moving |= any(given[name].moving is not None for name in scenes_named([edit]))
+        is_moving |= any(scenes[name].moving is not None for name in scenes_named([edit]))
         if is_moving and edited.moving is None:
             done[-1]["left_out"] = [MODES]
         recorded += done
@@ -111,7 +111,7 @@ def _move(scene: GaussianScene, edit: MoveEdit) -> GaussianScene:
     inside = within(scene, edit.shape)
     if not inside.any():
         raise InvalidArgument("shape must hold Gaussians of the scene, it holds none", field="shape")
-    scene = with_labels(scene, labels_of(scene), scene.info.label_names, made=not_recorded(scene) | inside)
+    scene = with_labels(scene, labels_of(scene), scene.info.label_names, unrecorded=not_recorded(scene) | inside)
     there = part(scene, inside)
     there = rebuilt(there, moved_gaussians(there, edit.motion), there.labels)
     return there if inside.all() else stacked(scene, [part(scene, ~inside), there])

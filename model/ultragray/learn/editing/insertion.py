@@ -115,10 +115,10 @@ def _inserted(
     lost_db = 2.0 * edit.frequency_mhz * max(0.0, attenuation - SOFT_TISSUE_DB)  # dB/cm, there and back
     body = _attenuating(body, lost_db / (edit.dynamic_range_db * max(level, _DARK)), distance, bounds)
     count = len(body.means)
-    body = with_labels(body, np.ones(count, np.uint8), {1: edit.label_name}, made=np.ones(count, bool))
+    body = with_labels(body, np.ones(count, np.uint8), {1: edit.label_name}, unrecorded=np.ones(count, bool))
     if outside is None:
-        told = {**scene.info.provenance, **body.info.provenance}
-        return rebuilt(scene, body.splats, body.labels, label_names=body.info.label_names, provenance=told)
+        provenance = {**scene.info.provenance, **body.info.provenance}
+        return rebuilt(scene, body.splats, body.labels, label_names=body.info.label_names, provenance=provenance)
     return joined(outside, body)
 
 
@@ -156,8 +156,8 @@ def _without(scene: GaussianScene, radius_mm: float, around: _Around) -> Gaussia
     reached = around.surface.reached_by(halved)
     outside = [] if reached.all() else [part(halved, ~reached)]
     if reached.any():
-        left = clipped(part(halved, reached), lambda points: -distance(points), _SOFT)
-        outside += [] if left is None else [left]
+        rest = clipped(part(halved, reached), lambda points: -distance(points), _SOFT)
+        outside += [] if rest is None else [rest]
     return stacked(halved, outside) if outside else None
 
 
@@ -199,16 +199,16 @@ def _filled(
     corner = 0.5 * (low + high) - 0.5 * side * (counts - 1)
     cubes = corner + side * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
     eighths = np.stack(np.meshgrid(*3 * [[-0.25, 0.25]], indexing="ij"), axis=-1).reshape(-1, 3)
-    found = []
+    levels = []
     while len(cubes):
         away = distance(cubes)
         near = np.abs(away) < 2.5 * side if side > 1.001 * smallest else np.zeros(len(cubes), bool)
         least = 0.0 if side > 1.001 * smallest else 0.5 * side
         kept = cubes[~near & (away < least)]
-        found.append(np.column_stack([kept, np.full(len(kept), side / _SPACING)]))
+        levels.append(np.column_stack([kept, np.full(len(kept), side / _SPACING)]))
         cubes = (cubes[near][:, None] + side * eighths).reshape(-1, 3)
         side /= 2.0
-    cells = np.concatenate(found)
+    cells = np.concatenate(levels)
     shaken = cells[:, :3] + 0.15 * cells[:, 3:] * np.random.default_rng(seed).normal(size=(len(cells), 3))
     like, count = scene.means, len(cells)
     means = torch.from_numpy((shaken - np.asarray(scene.info.centre_mm)) / 10.0).to(like)
@@ -299,7 +299,7 @@ def draw_lesions(scene: GaussianScene, edit: LesionsEdit) -> list[InsertEdit]:
     random, places = np.random.default_rng(edit.seed), means_mm(scene)
     origins, directions = probe.scan_lines(64)
     depths = probe.depths_mm(64)
-    found: list[InsertEdit] = []
+    lesions: list[InsertEdit] = []
     taken: list[tuple[FloatArray, float]] = []
     for _ in range(_TRIES * edit.count):
         tissue = edit.tissues[random.integers(len(edit.tissues))]
@@ -319,11 +319,11 @@ def draw_lesions(scene: GaussianScene, edit: LesionsEdit) -> list[InsertEdit]:
         shape: Shape = EllipsoidShape(centre_mm=_triple(middle), radii_mm=_triple(radii), turn_deg=_triple(turn))
         imaging: dict[str, Any] = {"frequency_mhz": edit.frequency_mhz, "dynamic_range_db": edit.dynamic_range_db}
         seed = int(random.integers(2**31))
-        found.append(InsertEdit(shape=shape, tissue=tissue, seed=seed, **imaging))
-        if len(found) == edit.count:
-            return found
+        lesions.append(InsertEdit(shape=shape, tissue=tissue, seed=seed, **imaging))
+        if len(lesions) == edit.count:
+            return lesions
     raise InvalidArgument(
-        f"the scene has room for {len(found)} lesions of this size, {edit.count} are asked for", field="count"
+        f"the scene has room for {len(lesions)} lesions of this size, {edit.count} are asked for", field="count"
     )
 
 

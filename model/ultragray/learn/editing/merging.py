@@ -69,8 +69,8 @@ def registered(scene: GaussianScene, other: GaussianScene, about: FloatArray) ->
     if not len(poses):
         raise InvalidArgument("the scenes to be merged share no place that both have seen", field="register")
     frames = render(other, None, poses, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"].cpu().numpy()
-    found = register_frames(scene, [*frames], poses, about, probe=other.info.probe)
-    return found.fit.base_to_scene
+    registration = register_frames(scene, [*frames], poses, about, probe=other.info.probe)
+    return registration.fit.base_to_scene
 
 
 def _common_poses(scene: GaussianScene, other: GaussianScene, motion: FloatArray) -> FloatArray:  # [C, 4, 4] mm
@@ -95,10 +95,10 @@ def _as_bright(other: GaussianScene, scene: GaussianScene) -> GaussianScene:
     both = (here["coverage"] > SUPPORT_COVERAGE) & (there["coverage"] > SUPPORT_COVERAGE)
     if int(both.sum()) < _LEAST_PIXELS:
         return other
-    wanted, given = here["echo"][both], there["echo"][both]
-    contrast = float(np.clip(float(wanted.std()) / max(float(given.std()), 1e-6), *_CONTRASTS))
+    wanted, present = here["echo"][both], there["echo"][both]
+    contrast = float(np.clip(float(wanted.std()) / max(float(present.std()), 1e-6), *_CONTRASTS))
     echo = torch.from_numpy(undirected_echo(other)).to(other.means)
-    return with_echo(other, float(wanted.mean()) + contrast * (echo - float(given.mean())), contrast)
+    return with_echo(other, float(wanted.mean()) + contrast * (echo - float(present.mean())), contrast)
 
 
 def _fitted(merged: GaussianScene, parents: tuple[GaussianScene, GaussianScene], steps: int) -> GaussianScene:
@@ -123,8 +123,8 @@ def _fitted(merged: GaussianScene, parents: tuple[GaussianScene, GaussianScene],
                 size: Any = {"height": height, "width": width, "outputs": ("bmode",)}
                 with torch.no_grad():
                     wanted = render(parent, probe, pose, **size)["bmode"]
-                found = render(current, probe, pose, **size)["bmode"]
-                torch.autograd.backward((found - wanted).abs().mean() / FIT_FRAMES)
+                bmode = render(current, probe, pose, **size)["bmode"]
+                torch.autograd.backward((bmode - wanted).abs().mean() / FIT_FRAMES)
             optimizer.step()
             schedule.step()
     return rebuilt(merged, {name: raw.detach() for name, raw in splats.items()}, merged.labels)
@@ -139,8 +139,8 @@ def _views(scene: GaussianScene) -> TrainingViews | None:
 def _distance_mm(scene: GaussianScene, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [N]
     """The interpolation distance of points to the training images; NOWHERE_MM where what was there was cut off."""
     views = _views(scene)
-    found = np.full(len(points), FAR_MM) if views is None else views.interpolation_mm(points)
-    return np.where(_is_kept(scene, points), found, NOWHERE_MM)
+    distances = np.full(len(points), FAR_MM) if views is None else views.interpolation_mm(points)
+    return np.where(_is_kept(scene, points), distances, NOWHERE_MM)
 
 
 def _is_kept(scene: GaussianScene, points: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]

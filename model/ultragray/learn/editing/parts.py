@@ -34,8 +34,8 @@ _HALF_MEAN, _HALF_DEVIATION = math.sqrt(2.0 / math.pi), math.sqrt(1.0 - 2.0 / ma
 
 
 def means_mm(scene: GaussianScene) -> FloatArray:  # [N, 3]
-    found: FloatArray = np.asarray(scene.info.centre_mm) + 10.0 * scene.means.detach().cpu().double().numpy()
-    return found
+    means: FloatArray = np.asarray(scene.info.centre_mm) + 10.0 * scene.means.detach().cpu().double().numpy()
+    return means
 
 
 def within(scene: GaussianScene, shape: Shape) -> BoolArray:  # [N]
@@ -99,8 +99,8 @@ def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
         table[label] = number = label_number(names, name)
         names[number] = name
     labels = np.concatenate([labels_of(scene), table[labels_of(other)]])
-    made = np.concatenate([not_recorded(scene), not_recorded(other)])
-    return with_labels(rebuilt(scene, splats, None, label_names={}), labels, names, made)
+    unrecorded = np.concatenate([not_recorded(scene), not_recorded(other)])
+    return with_labels(rebuilt(scene, splats, None, label_names={}), labels, names, unrecorded)
 
 
 def with_label(scene: GaussianScene, chosen: BoolArray, name: str | None) -> GaussianScene:

@@ -51,7 +51,7 @@ def importance(scene: GaussianScene) -> Tensor:  # [N]
         raise InvalidArgument("thin needs a scene that knows its training poses and its probe", field="kind")
     height, width = (min(side, MAX_SIDE) for side in scene.info.image_size_or(None, None))
     draw = BACKENDS[choose_backend("auto", scene)].draw
-    found = scene.means.new_zeros(len(scene.means))
+    importances = scene.means.new_zeros(len(scene.means))
     beam = beam_cm(scene.info.beam, probe)
     with torch.enable_grad():
         harmonics = torch.zeros_like(scene.sh0).requires_grad_()
@@ -64,11 +64,11 @@ def importance(scene: GaussianScene) -> Tensor:  # [N]
             with torch.no_grad():
                 echo = draw(rest, probe, poses, height, width, ("echo",), beam=beam)["echo"]
             planes = draw(grey, probe, poses, height, width, (WEIGHT_SUM, INTENSITY_SUM, "transmittance"), beam=beam)
-            sums, left = planes[WEIGHT_SUM].detach(), planes["transmittance"]
+            sums, transmittance = planes[WEIGHT_SUM].detach(), planes["transmittance"]
             share = torch.where(sums >= _LEAST_SUM, -torch.expm1(-sums) / sums.clamp(min=_LEAST_SUM), 0.0)
-            seen = share * left.detach()
+            seen = share * transmittance.detach()
             by_echo, by_opacity = torch.autograd.grad(
-                (planes[INTENSITY_SUM], left), (harmonics, opacity), (seen / _SLOPE, echo)
+                (planes[INTENSITY_SUM], transmittance), (harmonics, opacity), (seen / _SLOPE, echo)
             )
-            found += by_echo.flatten().abs() + by_opacity.abs() / torch.sigmoid(opacity.detach()).clamp(min=1e-6)
-    return found.detach()
+            importances += by_echo.flatten().abs() + by_opacity.abs() / torch.sigmoid(opacity.detach()).clamp(min=1e-6)
+    return importances.detach()

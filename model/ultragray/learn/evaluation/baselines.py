@@ -272,8 +272,8 @@ def interpolate_planes(sweep: Sweep, poses: FloatArray, frames: IntArray | None 
     before -1 where there are fewer; None: all of them.
     """
     if frames is None:
-        asked = sweep.probe.corners_from(poses)
-        frames = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)
+        corners = sweep.probe.corners_from(poses)
+        frames = corner_distances_mm(corners[:, None], sweep.corners_mm()[None]).argsort(axis=1)
     points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
     planes = np.empty((len(poses), sweep.height, sweep.width), np.float32)
     _cpu.interpolate_planes(

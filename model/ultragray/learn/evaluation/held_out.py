@@ -48,15 +48,15 @@ class HeldOutScores:
     @property
     def rows(self) -> dict[str, Evaluation]:
         """Those that there are, by what tables call them."""
-        found = {"as given": self.as_given, "on the path": self.on_path}
+        evaluations = {"as given": self.as_given, "on the path": self.on_path}
         if self.registered is not None:
-            found[f"registered by halves ({self.registered.moved_mm:.2f} mm)"] = self.registered.evaluation
-        return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
+            evaluations[f"registered by halves ({self.registered.moved_mm:.2f} mm)"] = self.registered.evaluation
+        return {name: evaluation for name, evaluation in evaluations.items() if evaluation is not None}
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object of three: mean and standard deviation of each metric, null where there are none."""
-        found = {"as_given": self.as_given, "on_path": self.on_path}
-        document: dict[str, Any] = {name: one and _means(one) for name, one in found.items()}
+        evaluations = {"as_given": self.as_given, "on_path": self.on_path}
+        document: dict[str, Any] = {name: one and _means(one) for name, one in evaluations.items()}
         registered = self.registered
         document["registered"] = registered and {**_means(registered.evaluation), "moved_mm": registered.moved_mm}
         return document
@@ -64,10 +64,10 @@ class HeldOutScores:
     def figures(self) -> dict[str, float]:
         """The means on the path and registered, as figures of a job."""
         registered = None if self.registered is None else self.registered.evaluation
-        found = {"on_path": self.on_path, "registered": registered}
+        evaluations = {"on_path": self.on_path, "registered": registered}
         return {
             f"{name}_{metric}": value
-            for name, evaluation in found.items()
+            for name, evaluation in evaluations.items()
             if evaluation is not None
             for metric, value in evaluation.mean.to_dict().items()
         }

@@ -66,11 +66,11 @@ def frame_metrics(rendered: Tensor, truth: Tensor) -> list[FrameMetrics]:
     Raises InvalidArgument where the shapes differ or `rendered` is not finite, and InvalidImageSize for images smaller
     than the window of MS-SSIM.
     """
-    found: list[FrameMetrics] = []
+    metrics: list[FrameMetrics] = []
     for pair in _pairs(rendered, truth):
         columns = [_psnr_db(*pair), _ms_ssim(*pair), *_gradient_similarity(*pair)]
-        found += [FrameMetrics(*values) for values in torch.stack(columns, dim=1).tolist()]
-    return found
+        metrics += [FrameMetrics(*values) for values in torch.stack(columns, dim=1).tolist()]
+    return metrics
 
 
 def ms_ssim(rendered: Tensor, truth: Tensor) -> list[float]:  # [C, H, W] both -> [C]

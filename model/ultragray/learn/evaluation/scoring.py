@@ -86,8 +86,8 @@ def evaluate(
         for some, frames in rendered_parts(scene, sweep, ("bmode",), backend):
             bmode = frames["bmode"].float().cpu()
             if scene.info.speckle is not None:
-                shown = with_speckle(scene, bmode, some.probe, scene.poses_at_rest(some.poses), backend=backend)
-                natural.extend(compare_speckle(shown.numpy(), some.images.astype(np.float32) / 255.0, some.probe))
+                images = with_speckle(scene, bmode, some.probe, scene.poses_at_rest(some.poses), backend=backend)
+                natural.extend(compare_speckle(images.numpy(), some.images.astype(np.float32) / 255.0, some.probe))
             yield bmode.numpy()
 
     return replace(_measured(predictions(), sweep, after_portion), frame_natural=natural)

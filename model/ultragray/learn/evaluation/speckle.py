@@ -88,13 +88,13 @@ class SpeckleSummary:
 
 def compare_speckle(rendered: FrameArray, truth: FrameArray, probe: Probe) -> list[FrameSpeckle]:  # [C, H, W] in [0, 1]
     tiles_mm = _pixels_mm(probe, *truth.shape[1:])
-    found = []
-    for shown, true in zip(rendered, truth, strict=True):
+    comparisons = []
+    for image, true in zip(rendered, truth, strict=True):
         calm = calmest(tiles_of(true))
-        distance = float(np.abs(np.sort(shown, axis=None) - np.sort(true, axis=None)).mean())
-        of_shown, of_true = (_speckle(frame, calm, tiles_mm[calm]) if len(calm) else None for frame in (shown, true))
-        found.append(FrameSpeckle(of_true, of_shown, distance))
-    return found
+        distance = float(np.abs(np.sort(image, axis=None) - np.sort(true, axis=None)).mean())
+        of_image, of_true = (_speckle(frame, calm, tiles_mm[calm]) if len(calm) else None for frame in (image, true))
+        comparisons.append(FrameSpeckle(of_true, of_image, distance))
+    return comparisons
 
 
 def summarize(frames: Sequence[FrameSpeckle]) -> SpeckleSummary:
@@ -193,7 +193,7 @@ class WindowPairs:
         row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
         middle = WINDOW_PIXELS * (np.stack([row, column], axis=1) + 0.5)  # [T, 2]
         points = probe.points_mm(middle[:, 0] / height, middle[:, 1] / width)
-        found: list[tuple[FloatArray, ...]] = []
+        windows: list[tuple[FloatArray, ...]] = []
         for first, second in pairs:
             calm = calmest(tiles_of(images[first]), CALM_PAIRED_SHARE)
             there = np.linalg.inv(poses[second]) @ poses[first]
@@ -205,7 +205,7 @@ class WindowPairs:
             turn = np.degrees(np.arccos(np.clip(poses[first][:3, 2] @ poses[second][:3, 2], -1.0, 1.0)))
             count = int(fits.sum())
             own = (WINDOW_PIXELS * np.stack([row, column], axis=1))[calm][fits]
-            found.append(
+            windows.append(
                 (
                     np.tile([first, second], (count, 1)),
                     np.stack([own, corner[fits]], axis=1),
@@ -214,7 +214,7 @@ class WindowPairs:
                     middle[calm][fits, 0] / height,
                 )
             )
-        frames, corners, elevation, angle, depth = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        frames, corners, elevation, angle, depth = (np.concatenate(parts) for parts in zip(*windows, strict=True))
         return cls(frames, corners, elevation, angle, depth)
 
     def select(self, chosen: npt.NDArray[np.bool_]) -> WindowPairs:

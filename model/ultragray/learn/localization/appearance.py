@@ -120,8 +120,8 @@ class Scale:
         smooth = self._blurred(frames.numpy(), 1.0)
         structure = smooth - self._blurred(smooth, NEIGHBOURHOOD)
         strength = self._blurred(np.square(structure), NEIGHBOURHOOD)
-        shown: PixelArray = structure / np.sqrt(strength + np.float32(LEAST_STRENGTH**2))
-        return shown
+        appearance: PixelArray = structure / np.sqrt(strength + np.float32(LEAST_STRENGTH**2))
+        return appearance
 
     def _blurred(self, frames: PixelArray, times: float) -> PixelArray:
         """By OpenCV: on a busy machine torch's threads wait for each other many times as long as this takes."""

@@ -121,11 +121,11 @@ def localize(
     what render() raises.
     """
     frame = _checked_image(image)
-    asked = LocalizationSettings(within_mm=within_mm, within_deg=within_deg, search=search)
+    settings = LocalizationSettings(within_mm=within_mm, within_deg=within_deg, search=search)
     known = scene.info.probe_or(probe)
     motions, rendered = Motions.of(known), _renderer(scene, known, backend, limits)
     looked = _Search(frame, known, motions, rendered)
-    if asked.search is SearchKind.ANYWHERE:
+    if settings.search is SearchKind.ANYWHERE:
         index = scene.prepared(f"places of {known!r}", lambda: Places.of(scene, known, motions, rendered))
         starts = first = index.nearest(frame)
         poses = looked.begin(starts)
@@ -133,15 +133,15 @@ def localize(
         first = torch.from_numpy(scene.poses_at_rest(_one_start(start)))
         poses = (
             first
-            if asked.search is SearchKind.TRACK
+            if settings.search is SearchKind.TRACK
             else looked.begin(_starts(first[0], motions, within_mm, within_deg))
         )
-    stages = TRACKING if asked.search is SearchKind.TRACK else STAGES
+    stages = TRACKING if settings.search is SearchKind.TRACK else STAGES
     for stage in stages:
         fit = looked.improve(poses, stage)
         poses = fit.poses
-    found = looked.result(fit, first[0], stages[-1])
-    return replace(found, pose=scene.poses_as_tracked(found.pose[None])[0])
+    result = looked.result(fit, first[0], stages[-1])
+    return replace(result, pose=scene.poses_as_tracked(result.pose[None])[0])
 
 
 def _renderer(scene: GaussianScene, probe: Probe, backend: str, limits: Limits) -> Rendered:
@@ -167,10 +167,10 @@ def _renderer(scene: GaussianScene, probe: Probe, backend: str, limits: Limits) 
 def _one_start(start: Any) -> FloatArray:  # [1, 4, 4]
     if start is None:
         raise InvalidPose("start is required, unless a frame is looked for anywhere", field="start")
-    told = check_poses(start, field="start")
-    if len(told) != 1:
-        raise InvalidArgument(f"start must be one pose, got {len(told)}", field="start")
-    return told
+    poses = check_poses(start, field="start")
+    if len(poses) != 1:
+        raise InvalidArgument(f"start must be one pose, got {len(poses)}", field="start")
+    return poses
 
 
 class Tracker:
@@ -188,21 +188,21 @@ class Tracker:
         it is not found there; anywhere where it is not found there either. After frames that were not found it is
         looked for both about the last one and anywhere, for the better of the two. Raises what localize() raises.
         """
-        tried = []
+        results = []
         if self._last is not None and self._motion is not None:
-            tried.append(self._localized(image, self._last @ self._motion, SearchKind.TRACK))
-        if self._last is not None and not any(one.is_found for one in tried):
-            tried.append(self._localized(image, self._last, SearchKind.NEAR))
-        if self._is_lost or not any(one.is_found for one in tried):
-            tried.append(self._localized(image, None, SearchKind.ANYWHERE))
-        found = max(tried, key=lambda one: (one.is_found, one.similarity))
-        if found.is_found:
-            before = found.pose if self._last is None or self._is_lost else self._last
-            self._motion, self._last = np.linalg.inv(before) @ found.pose, found.pose
+            results.append(self._localized(image, self._last @ self._motion, SearchKind.TRACK))
+        if self._last is not None and not any(one.is_found for one in results):
+            results.append(self._localized(image, self._last, SearchKind.NEAR))
+        if self._is_lost or not any(one.is_found for one in results):
+            results.append(self._localized(image, None, SearchKind.ANYWHERE))
+        best = max(results, key=lambda one: (one.is_found, one.similarity))
+        if best.is_found:
+            before = best.pose if self._last is None or self._is_lost else self._last
+            self._motion, self._last = np.linalg.inv(before) @ best.pose, best.pose
         else:
             self._motion = None
-        self._is_lost = not found.is_found
-        return found
+        self._is_lost = not best.is_found
+        return best
 
     def _localized(self, image: Any, start: FloatArray | None, search: SearchKind) -> Localization:
         return localize(self._scene, image, start, probe=self._probe, search=search)
@@ -233,18 +233,18 @@ def move_together(
     about = Motions(middle, motions.lever_mm)
     whole = torch.eye(4, dtype=torch.float64)
     for stage in TOGETHER:
-        tried = []
+        trials = []
         for _ in range(ROUNDS):
             placed = whole @ first
             at_rest = torch.from_numpy(scene.poses_at_rest(placed.numpy()))
             fits = [one.linearised(pose[None], stage) for one, pose in zip(searches, at_rest, strict=True)]
-            left = np.concatenate([fit.left[0] for fit in fits])
-            tried.append((float(np.square(left).mean()), whole))
+            residuals = np.concatenate([fit.residuals[0] for fit in fits])
+            trials.append((float(np.square(residuals).mean()), whole))
             jacobians = (_jacobian(about, motions, pose).numpy() for pose in placed)
             changes = np.concatenate([own.T @ fit.changes[0] for own, fit in zip(jacobians, fits, strict=True)], axis=1)
-            joint = _Fit(whole[None], left[None], changes[None], np.zeros(1, np.int64))
+            joint = _Fit(whole[None], residuals[None], changes[None], np.zeros(1, np.int64))
             whole = about.of_steps(torch.from_numpy(_step(joint, np.array([START_DAMPING]))))[0] @ whole
-        whole = min(tried, key=lambda one: one[0])[1]
+        whole = min(trials, key=lambda one: one[0])[1]
     return np.asarray(whole.numpy())
 
 
@@ -331,23 +331,23 @@ class _Fit:
     """
 
     poses: Tensor  # [K, 4, 4]
-    left: FloatArray  # [K, pixels], of the frame
-    changes: FloatArray  # [K, 6, pixels] per mm, of what is left by the six numbers
+    residuals: FloatArray  # [K, pixels], of the frame
+    changes: FloatArray  # [K, 6, pixels] per mm, of the residuals by the six numbers
     corrections: IntArray  # [K], of the changes since they were taken
 
     @property
     def error(self) -> FloatArray:  # [K]
-        error: FloatArray = np.square(self.left).mean(axis=1)
+        error: FloatArray = np.square(self.residuals).mean(axis=1)
         return error
 
-    def after(self, steps: FloatArray, poses: Tensor, left: FloatArray) -> tuple[BoolArray, _Fit]:  # [K, 6] mm
+    def after(self, steps: FloatArray, poses: Tensor, residuals: FloatArray) -> tuple[BoolArray, _Fit]:  # [K, 6] mm
         """Where steps led to something better, [K], and the fit at the better poses, its changes corrected."""
-        missed = left - self.left - (steps[:, None] @ self.changes)[:, 0]
+        missed = residuals - self.residuals - (steps[:, None] @ self.changes)[:, 0]
         along = steps / np.square(steps).sum(axis=1, keepdims=True).clip(min=np.finfo(np.float64).tiny)
-        better = np.square(left).mean(axis=1) < self.error
+        better = np.square(residuals).mean(axis=1) < self.error
         return better, _Fit(
             torch.where(torch.from_numpy(better)[:, None, None], poses, self.poses),
-            np.where(better[:, None], left, self.left),
+            np.where(better[:, None], residuals, self.residuals),
             self.changes + along[..., None] * missed[:, None],
             self.corrections + 1,
         )
@@ -355,13 +355,13 @@ class _Fit:
     def best(self, count: int) -> _Fit:
         """The fit at the poses that fit best, the first of equals first."""
         which = self.error.argsort(kind="stable")[:count]
-        return _Fit(self.poses[which], self.left[which], self.changes[which], self.corrections[which])
+        return _Fit(self.poses[which], self.residuals[which], self.changes[which], self.corrections[which])
 
     def replaced(self, which: BoolArray, other: _Fit) -> _Fit:  # [K], of poses that the other has
         """The fit, some of whose poses have been taken anew."""
-        left, changes, corrections = self.left.copy(), self.changes.copy(), self.corrections.copy()
-        left[which], changes[which], corrections[which] = other.left, other.changes, other.corrections
-        return _Fit(self.poses, left, changes, corrections)
+        residuals, changes, corrections = self.residuals.copy(), self.changes.copy(), self.corrections.copy()
+        residuals[which], changes[which], corrections[which] = other.residuals, other.changes, other.corrections
+        return _Fit(self.poses, residuals, changes, corrections)
 
 
 class _Search:
@@ -377,7 +377,7 @@ class _Search:
         if len(starts) <= MOST_BEGUN:
             return starts
         scale, target = self._at(COARSE)
-        error = np.square(self._left(starts, scale, target)).mean(axis=1)
+        error = np.square(self._residuals(starts, scale, target)).mean(axis=1)
         return starts[error.argsort(kind="stable")[:MOST_BEGUN]]
 
     def improve(self, poses: Tensor, stage: Stage) -> _Fit:  # [K, 4, 4] -> of the best `kept`
@@ -386,30 +386,30 @@ class _Search:
         fit = self._linearised(poses, stage, scale, target)
         damping = np.full(len(poses), START_DAMPING)
         short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is LAST else SHORT_STEP)
-        for left in reversed(range(stage.steps)):
+        for rest in reversed(range(stage.steps)):
             steps = _step(fit, damping)
             has_arrived = np.linalg.norm(steps, axis=1) < short_mm
             was_fresh = fit.corrections == 0
             if (has_arrived & was_fresh).all():
                 break
-            tried = self._motions.moved(fit.poses, torch.from_numpy(steps))
-            better, fit = fit.after(steps, tried, self._left(tried, scale, target))
+            new_poses = self._motions.moved(fit.poses, torch.from_numpy(steps))
+            better, fit = fit.after(steps, new_poses, self._residuals(new_poses, scale, target))
             is_misled = ~better & ~was_fresh
             damping = np.where(better, damping / LESS_DAMPING, damping * np.where(is_misled, 1.0, MORE_DAMPING))
             doubtful = is_misled | (has_arrived & ~was_fresh) | (better & (fit.corrections >= stage.corrected))
-            if left and doubtful.any():
+            if rest and doubtful.any():
                 fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
         return fit.best(stage.kept)
 
     def result(self, fit: _Fit, start: Tensor, stage: Stage) -> Localization:
-        """What is told of the best pose of the last stage: of a search by all numbers, of a track by its last step."""
+        """The result at the best pose of the last stage: of a search by all numbers, of a track by its last step."""
         (scale, target), pose = self._at(stage), fit.poses[0]
         if stage is LAST:
             fit = self._linearised(pose[None], stage, scale, target, ALL)
         sought = _flat(target)
-        similarity = _correlation(fit.left[0] + sought, sought)
-        left, changes = fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape)
-        deviations = torch.from_numpy(_deviations(left, changes))
+        similarity = _correlation(fit.residuals[0] + sought, sought)
+        residuals, changes = fit.residuals[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape)
+        deviations = torch.from_numpy(_deviations(residuals, changes))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
         return Localization(
             pose=pose.numpy(),
@@ -429,7 +429,7 @@ class _Search:
             self._targets[stage] = scale, scale.appearance(scale.resized(self._frame)[None])[0]
         return self._targets[stage]
 
-    def _left(self, poses: Tensor, scale: Scale, target: PixelArray) -> FloatArray:  # [K, 4, 4] -> [K, pixels]
+    def _residuals(self, poses: Tensor, scale: Scale, target: PixelArray) -> FloatArray:  # [K, 4, 4] -> [K, pixels]
         return _missed(self._frames(poses, scale.rows, scale.columns), scale, target)
 
     def _frames(self, poses: Tensor, rows: int, columns: int) -> Tensor:  # [K, 4, 4] -> [K, rows, columns]
@@ -480,8 +480,8 @@ def _flat(images: PixelArray) -> FloatArray:  # [..., rows, columns] -> [..., pi
 
 def _step(fit: _Fit, damping: FloatArray) -> FloatArray:  # [K] -> [K, 6] mm
     """Downhill, damped by the curvature of each number, and not too far."""
-    pixels = fit.left.shape[-1]
-    slope = (fit.changes @ fit.left[..., None]) / pixels
+    pixels = fit.residuals.shape[-1]
+    slope = (fit.changes @ fit.residuals[..., None]) / pixels
     curvature = fit.changes @ fit.changes.swapaxes(1, 2) / pixels  # Gauss and Newton's
     own = curvature.diagonal(axis1=1, axis2=2)
     # Where nothing changes, as in a black frame, epsilon gives the matrix an inverse.
@@ -520,25 +520,26 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
         )
     grey = array.astype(np.float32) / (255.0 if array.dtype == np.uint8 else 1.0)
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.max() > 1.0:
-        got = f"{array.dtype} from {grey.min():g} to {grey.max():g}"
-        raise InvalidArgument(f"image must hold finite values in [0, 1], or uint8, got {got}", field="image")
+        description = f"{array.dtype} from {grey.min():g} to {grey.max():g}"
+        raise InvalidArgument(f"image must hold finite values in [0, 1], or uint8, got {description}", field="image")
     return torch.from_numpy(grey)
 
 
-def _deviations(left: FloatArray, changes: FloatArray) -> FloatArray:  # [H, W], [6, H, W] per mm -> [6] mm
+def _deviations(residuals: FloatArray, changes: FloatArray) -> FloatArray:  # [H, W], [6, H, W] per mm -> [6] mm
     """The standard deviations of the six numbers at the best fit.
 
-    What is left is alike in neighbouring pixels, and larger in some parts of the image than in others. So the image is
+    Residuals are alike in neighbouring pixels, and larger in some parts of the image than in others. So the image is
     cut into blocks, and the fit repeated without each of them in turn: what these fits scatter by, times K − 1, is the
     variance (the jackknife, of clusters). It misses what errs alike in all blocks, as SCENE_ERROR has it.
     """
-    rows, columns = (np.arange(count + 1) * side // count for side, count in zip(left.shape, BLOCKS, strict=True))
-    parts = [np.s_[..., top:bottom, a:b] for top, bottom in pairwise(rows) for a, b in pairwise(columns)]
-    flat = [(changes[part].reshape(6, -1), left[part].ravel()) for part in parts]
-    curvatures, slopes = np.stack([of @ of.T for of, _ in flat]), np.stack([of @ rest for of, rest in flat])
-    others = np.linalg.pinv(curvatures.sum(axis=0) - curvatures, hermitian=True)
-    fits = (others @ (slopes.sum(axis=0) - slopes)[..., None])[..., 0]  # [K, 6]
-    deviations: FloatArray = SCENE_ERROR * math.sqrt(len(parts) - 1) * fits.std(axis=0)
+    rows, columns = (np.arange(count + 1) * side // count for side, count in zip(residuals.shape, BLOCKS, strict=True))
+    blocks = [np.s_[..., top:bottom, left:right] for top, bottom in pairwise(rows) for left, right in pairwise(columns)]
+    pixels = [(changes[block].reshape(6, -1), residuals[block].ravel()) for block in blocks]
+    curvatures = np.stack([own @ own.T for own, _ in pixels])
+    slopes = np.stack([own @ residual for own, residual in pixels])
+    inverses = np.linalg.pinv(curvatures.sum(axis=0) - curvatures, hermitian=True)
+    fits = (inverses @ (slopes.sum(axis=0) - slopes)[..., None])[..., 0]  # [K, 6]
+    deviations: FloatArray = SCENE_ERROR * math.sqrt(len(blocks) - 1) * fits.std(axis=0)
     return deviations
 
 

@@ -39,7 +39,7 @@ def evenly_spread(count: int, dimensions: int, first: int = 0) -> FloatArray:  #
 
 
 def poses_in_reach(
-    training_poses: FloatArray, known: Probe | None, probe: Probe, asked: PlanSettings, plane: FloatArray | None
+    training_poses: FloatArray, known: Probe | None, probe: Probe, settings: PlanSettings, plane: FloatArray | None
 ) -> FloatArray:  # [P, 4, 4] mm, [4] -> [C, 4, 4] mm
     """At most CANDIDATES poses of a probe on the skin under training views of the probe `known`.
 
@@ -53,26 +53,26 @@ def poses_in_reach(
             f"{error.detail.replace('contact', 'a reach on the skin', 1)}: name the poses", field="poses"
         ) from None
     surface = _Surface(skin)
-    box = None if asked.box_mm is None else box_of(asked.box_mm, "box_mm")
-    found: list[FloatArray] = []
+    box = None if settings.box_mm is None else box_of(settings.box_mm, "box_mm")
+    blocks: list[FloatArray] = []
     for number in range(_ROUNDS):
         spread = evenly_spread(CANDIDATES, 5, first=number * CANDIDATES)
         places = surface.places(spread[:, :2], box)
-        angles = np.radians((asked.tilt_deg, asked.rock_deg, asked.turn_deg)) * (2.0 * spread[:, 2:] - 1.0)
-        made = _held(surface, places, angles, probe)
+        angles = np.radians((settings.tilt_deg, settings.rock_deg, settings.turn_deg)) * (2.0 * spread[:, 2:] - 1.0)
+        candidates = _poses(surface, places, angles, probe)
         if plane is not None:
-            in_plane = _moved_into(plane, surface, made[::2], probe, asked)
-            made = np.concatenate([in_plane, made[1::2]])
-        found.append(made[_allowed(skin, probe, made, asked)])
-        if sum(map(len, found)) >= CANDIDATES:
+            in_plane = _moved_into(plane, surface, candidates[::2], probe, settings)
+            candidates = np.concatenate([in_plane, candidates[1::2]])
+        blocks.append(candidates[_allowed(skin, probe, candidates, settings)])
+        if sum(map(len, blocks)) >= CANDIDATES:
             break
-    poses = np.concatenate(found)[:CANDIDATES]
+    poses = np.concatenate(blocks)[:CANDIDATES]
     if not len(poses):
         where = "" if box is None else " within box_mm"
         raise InvalidArgument(
             f"no pose is in reach: nowhere on the known skin{where} have {LEAST_CONTACT:.0%} of the scan lines contact "
             "at such angles",
-            field="box_mm" if asked.box_mm else "rock_deg",
+            field="box_mm" if settings.box_mm else "rock_deg",
         )
     return poses
 
@@ -119,7 +119,7 @@ def _upright(axial: FloatArray, lateral: FloatArray) -> FloatArray:  # [C, 3] bo
     return np.stack([lateral, np.cross(axial, lateral), axial], axis=2)
 
 
-def _held(surface: _Surface, places: FloatArray, angles: FloatArray, probe: Probe) -> FloatArray:  # [C, 2], [C, 3] rad
+def _poses(surface: _Surface, places: FloatArray, angles: FloatArray, probe: Probe) -> FloatArray:  # [C, 2], [C, 3] rad
     points, straight = surface.at(places)
     turns = [
         about_axes(np.tile(axis, (len(angles), 1)), angle) for axis, angle in zip(np.eye(3), angles.T, strict=True)
@@ -138,7 +138,7 @@ def _faces(poses: FloatArray, probe: Probe) -> FloatArray:  # [C, 4, 4] -> [C, 3
 
 
 def _moved_into(
-    plane: FloatArray, surface: _Surface, poses: FloatArray, probe: Probe, asked: PlanSettings
+    plane: FloatArray, surface: _Surface, poses: FloatArray, probe: Probe, settings: PlanSettings
 ) -> FloatArray:  # [4], [C, 4, 4] -> [≤ C, 4, 4]
     """Poses moved along the skin into a plane and turned so that their images lie in it, where the angles allow it."""
     normal, faces = plane[:3], _faces(poses, probe)
@@ -156,19 +156,19 @@ def _moved_into(
     tilt = np.arctan2(-relative[:, 1, 2], relative[:, 2, 2])
     rock = np.arcsin(np.clip(relative[:, 0, 2], -1.0, 1.0))
     turn = np.arctan2(-relative[:, 0, 1], relative[:, 0, 0])
-    most = np.array([asked.tilt_deg, asked.rock_deg, asked.turn_deg]) + 1e-6
+    most = np.array([settings.tilt_deg, settings.rock_deg, settings.turn_deg]) + 1e-6
     fits = (np.degrees(np.abs(np.stack([tilt, rock, turn], axis=1))) <= most).all(axis=1) & (slope[:, 0] > 1e-6)
     return _with_faces(faces[fits], rotations[fits], probe)
 
 
-def _allowed(skin: Skin, probe: Probe, poses: FloatArray, asked: PlanSettings) -> BoolArray:  # [C]
+def _allowed(skin: Skin, probe: Probe, poses: FloatArray, settings: PlanSettings) -> BoolArray:  # [C]
     touching: BoolArray = Touch.of(skin, probe, poses, _LINES).shares >= LEAST_CONTACT
-    return touching & within_box(poses, probe, asked)
+    return touching & within_box(poses, probe, settings)
 
 
-def within_box(poses: FloatArray, probe: Probe, asked: PlanSettings) -> BoolArray:  # [C, 4, 4] mm -> [C]
+def within_box(poses: FloatArray, probe: Probe, settings: PlanSettings) -> BoolArray:  # [C, 4, 4] mm -> [C]
     """Whether the middle of the probe's face lies in the box that is asked for, if one is."""
-    if asked.box_mm is None:
+    if settings.box_mm is None:
         return np.ones(len(poses), bool)
-    (low, high), faces = box_of(asked.box_mm, "box_mm"), _faces(poses, probe)
+    (low, high), faces = box_of(settings.box_mm, "box_mm"), _faces(poses, probe)
     return np.asarray(((faces >= low) & (faces <= high)).all(axis=1), bool)

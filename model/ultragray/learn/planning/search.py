@@ -79,10 +79,10 @@ class Map:
         x, y, z = np.moveaxis(np.rint((points - self.grid.origin_mm) / self.grid.spacing_mm).astype(np.intp), -1, 0)
         depth, rows, columns = self._values.shape
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z >= 0) & (z < depth)
-        found: np.ndarray[Any, Any] = self._values[
+        values: np.ndarray[Any, Any] = self._values[
             np.where(inside, z, 0), np.where(inside, y, 0), np.where(inside, x, 0)
         ]
-        return np.where(inside, found, 0)
+        return np.where(inside, values, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Targets:
     def of(
         cls,
         scene: GaussianScene,
-        asked: PlanSettings,
+        settings: PlanSettings,
         view: FloatArray | None,  # [4, 4]
         plane: FloatArray | None,  # [4]
         candidates: FloatArray,  # [C, 4, 4]
@@ -107,11 +107,11 @@ class Targets:
         Raises InvalidArgument where none are left, and for a label of a scene that has none.
         """
         low, high = np.array(scene.info.bounds_min_mm), np.array(scene.info.bounds_max_mm)
-        if asked.region_mm is not None:
-            low, high = box_of(asked.region_mm, "region_mm")
+        if settings.region_mm is not None:
+            low, high = box_of(settings.region_mm, "region_mm")
         spread = evenly_spread(POINTS, 3)
         directions = (spread[:, 2] * len(candidates)).astype(np.int64)
-        anywhere = asked.region_mm is None and asked.label is None and plane is None
+        anywhere = settings.region_mm is None and settings.label is None and plane is None
         if view is not None or anywhere:
             whose = candidates[directions] if view is None else view[None]
             inside = probe.points_mm(spread[:, 0], spread[:, 1])
@@ -122,17 +122,17 @@ class Targets:
         if plane is not None and view is None:
             points = points - (points @ plane[:3] - plane[3])[:, None] * plane[:3]
         counts = np.ones(len(points), bool)
-        if asked.region_mm is not None or plane is not None:
+        if settings.region_mm is not None or plane is not None:
             counts &= ((points >= low) & (points <= high)).all(axis=1)
-        if asked.label is not None:
+        if settings.label is not None:
             if scene.labels is None:
                 raise InvalidArgument(
                     "label is for scenes whose Gaussians carry labels, these carry none", field="label"
                 )
-            counts &= Map(scene, "labels", low, high).at(points) == asked.label
+            counts &= Map(scene, "labels", low, high).at(points) == settings.label
         chosen = np.flatnonzero(counts)
         if not len(chosen):
-            names = [name for name in ("label", "plane", "region_mm") if getattr(asked, name) is not None]
+            names = [name for name in ("label", "plane", "region_mm") if getattr(settings, name) is not None]
             raise InvalidArgument(
                 f"nothing of the scene has {' and '.join(names)} as asked for: no point is left that counts",
                 field=names[0],
@@ -159,18 +159,18 @@ def distances_mm(poses: FloatArray, probe: Probe, points: FloatArray) -> Values:
     aside = edges.scale * np.abs(x - edges.slope * z) - edges.across * z - edges.half
     depth = np.hypot(x, z) if edges.fanned else edges.by_z * z
     beyond = np.maximum(probe.near_mm - depth, depth - probe.far_mm)
-    found: Values = np.sqrt(y * y + np.maximum(aside, 0.0) ** 2 + np.maximum(beyond, 0.0) ** 2)
-    return found
+    distances: Values = np.sqrt(y * y + np.maximum(aside, 0.0) ** 2 + np.maximum(beyond, 0.0) ** 2)
+    return distances
 
 
-def curve_of(asked: PlanSettings, model: ConfidenceModel | None, hardness: Values) -> Curve:  # [V]
+def curve_of(settings: PlanSettings, model: ConfidenceModel | None, hardness: Values) -> Curve:  # [V]
     """φ for what is wanted. Of confidence the distance between views is taken as if they were on one side.
 
     Raises InvalidArgument where the scene does not have the model that is needed.
     """
-    match asked.want:
+    match settings.want:
         case "coverage":
-            return lambda distance, _: np.exp2(-distance / asked.within_mm)
+            return lambda distance, _: np.exp2(-distance / settings.within_mm)
         case "confidence" if model is not None:
             return partial(_expected, model.weights, hardness)
         case "uncertainty" if model is not None and model.uncertainty is not None:
@@ -178,7 +178,9 @@ def curve_of(asked: PlanSettings, model: ConfidenceModel | None, hardness: Value
             reaches = [(shares[f"gap {reach:g} mm"], reach) for reach in GAPS_MM] + [(shares["beyond"], BEYOND_MM)]
             if (total := sum(share for share, _ in reaches)) > 0.0:
                 return lambda distance, _: sum(share * np.exp(-distance / reach) for share, reach in reaches) / total
-    raise InvalidArgument(f"this scene tells no {asked.want}: want coverage, or train it with confidence", field="want")
+    raise InvalidArgument(
+        f"this scene tells no {settings.want}: want coverage, or train it with confidence", field="want"
+    )
 
 
 def _expected(weights: Sequence[float], hardness: Values, distance: Values, angle: Values) -> Any:
@@ -275,9 +277,9 @@ def exchange(worth: Values, before: Values, chosen: Sequence[int], *, shade: Cal
         for place, view in enumerate(views):
             others = np.maximum.reduce([before, *worth[views[:place] + views[place + 1 :]]])
             gain = np.maximum(worth[view] - others, 0.0).mean(dtype=np.float64)
-            found, gains = choose(worth, others, 1, shade=shade)
-            if found and gains[0] > (1.0 + _LEAST_MORE) * gain:
-                views[place], is_changed = found[0], True
+            better, gains = choose(worth, others, 1, shade=shade)
+            if better and gains[0] > (1.0 + _LEAST_MORE) * gain:
+                views[place], is_changed = better[0], True
         if not is_changed:
             break
     return views
@@ -313,10 +315,10 @@ def _with_ends(steps_mm: FloatArray, from_start_mm: FloatArray | None) -> FloatA
 
 def _nearest_next(steps_mm: FloatArray, first: int) -> IntArray:  # [K, K] -> [K]
     order = [first]
-    left = np.ones(len(steps_mm), bool)
+    unvisited = np.ones(len(steps_mm), bool)
     for _ in range(len(steps_mm) - 1):
-        left[order[-1]] = False
-        order.append(int(np.where(left, steps_mm[order[-1]], np.inf).argmin()))
+        unvisited[order[-1]] = False
+        order.append(int(np.where(unvisited, steps_mm[order[-1]], np.inf).argmin()))
     return np.array(order, np.int64)
 
 
@@ -361,9 +363,9 @@ class Way:
     def _look(self) -> None:
         """Measures the detour to each candidate, at each place of the way [C, K + 1]."""
         stops = np.column_stack([self._from_start_mm, self._to_views_mm, np.zeros(len(self._corners))])  # [C, K + 2]
-        begun = self._from_start_mm[self.views[:1]]
+        first_step = self._from_start_mm[self.views[:1]]
         between = self._to_views_mm[self.views[:-1], np.arange(1, len(self.views))]
-        steps = np.concatenate([begun, between, np.zeros(1)])
+        steps = np.concatenate([first_step, between, np.zeros(1)])
         self._detours_mm = stops[:, :-1] + stops[:, 1:] - steps
         detours = np.maximum(self._detours_mm.min(axis=1), 0.0)
         self.costs[:] = np.where(self.length_mm + detours <= self._most_mm, detours + _LEAST_DETOUR_MM, np.inf)
@@ -371,7 +373,7 @@ class Way:
 
 def plan_views(
     scene: GaussianScene,
-    asked: PlanSettings | None = None,
+    settings: PlanSettings | None = None,
     *,
     poses: Any = None,
     view: Any = None,
@@ -384,39 +386,39 @@ def plan_views(
     standard plane: only the points of its image count; `start` [4, 4] is where the probe is (None: the way begins
     anywhere). Raises InvalidArgument, InvalidPose, InvalidProbe; GivenUp by `limits`.
     """
-    asked = asked or PlanSettings()
+    settings = settings or PlanSettings()
     at_rest = scene.at_rest()
-    probe, recorded = scene.info.probe_or(asked.probe), at_rest.training_poses
+    probe, recorded = scene.info.probe_or(settings.probe), at_rest.training_poses
 
     standard, begin = _single(scene, view, "view"), _single(scene, start, "start")
     plane = None
-    if standard is not None and asked.plane is not None:
+    if standard is not None and settings.plane is not None:
         raise InvalidArgument("view is a plane of its own: give view or plane, not both", field="plane")
     if standard is not None:
         plane = np.append(standard[:3, 1], standard[:3, 1] @ standard[:3, 3])
-    elif asked.plane is not None:
-        plane = np.array(asked.plane) / np.linalg.norm(asked.plane[:3])
-        plane[3] = asked.plane[3]
+    elif settings.plane is not None:
+        plane = np.array(settings.plane) / np.linalg.norm(settings.plane[:3])
+        plane[3] = settings.plane[3]
     if poses is None:
-        candidates = poses_in_reach(recorded, scene.info.probe, probe, asked, plane)
+        candidates = poses_in_reach(recorded, scene.info.probe, probe, settings, plane)
     else:
         candidates = scene.poses_at_rest(check_poses(poses))
         if not 1 <= len(candidates) <= MAX_LISTED:
             raise InvalidArgument(f"poses must be 1 to {MAX_LISTED}, got {len(candidates)}", field="poses")
-        candidates = candidates[within_box(candidates, probe, asked)]
+        candidates = candidates[within_box(candidates, probe, settings)]
         if not len(candidates):
             raise InvalidArgument("none of the poses has the middle of the probe's face within box_mm", field="box_mm")
-    targets = Targets.of(at_rest, asked, standard, plane, candidates, probe)
+    targets = Targets.of(at_rest, settings, standard, plane, candidates, probe)
     limits.check_flag()
     model, hardness = read_model(scene.info.confidence, len(recorded)), np.zeros(len(targets.points), np.float32)
-    own, places = scene.info.probe_or(asked.probe), spread_places(len(recorded), MOST_RECORDED)
+    own, places = scene.info.probe_or(settings.probe), spread_places(len(recorded), MOST_RECORDED)
     recorded = recorded[places]
     if model is not None:  # of the recorded view that is nearest to each point
         hardness = np.array(model.hardness, np.float32)[places][
             distances_mm(recorded, own, targets.points).argmin(axis=0)
         ]
     attenuation = Map(at_rest, "attenuation", *map(np.array, (scene.info.bounds_min_mm, scene.info.bounds_max_mm)))
-    worth_of = partial(worth_without_shadow, curve_of(asked, model, hardness), targets, candidates)
+    worth_of = partial(worth_without_shadow, curve_of(settings, model, hardness), targets, candidates)
     best = np.zeros(len(targets.points), np.float32)
     for pose, worth in zip(recorded, worth_of(recorded, own), strict=True):
         shade(worth, best, targets.points, pose, own, attenuation)
@@ -425,7 +427,7 @@ def plan_views(
     before, worths = float(best.mean(dtype=np.float64)), worth_of(candidates, probe)
     corners = probe.corners_from(candidates)
     from_start = None if begin is None else corner_distances_mm(corners, probe.corners_from(begin[None]))
-    way = None if asked.path_mm is None else Way(corners, from_start, asked.path_mm)
+    way = None if settings.path_mm is None else Way(corners, from_start, settings.path_mm)
 
     is_shaded = np.zeros(len(candidates), bool)
 
@@ -441,10 +443,10 @@ def plan_views(
             limits.check_flag()
             way.add(view)
 
-        chosen, gains = choose(worths, best.copy(), asked.views, shade=shade_once, costs=way.costs, after_each=go_on)
+        chosen, gains = choose(worths, best.copy(), settings.views, shade=shade_once, costs=way.costs, after_each=go_on)
         order, path_mm = np.array([chosen.index(view) for view in way.views], np.int64), way.length_mm
     else:
-        chosen, _ = choose(worths, best.copy(), asked.views, shade=shade_once)
+        chosen, _ = choose(worths, best.copy(), settings.views, shade=shade_once)
         chosen = exchange(worths, best, chosen, shade=shade_once)
         ranks, gains = choose(worths[chosen], best, len(chosen))
         chosen = [chosen[rank] for rank in ranks]
@@ -452,7 +454,7 @@ def plan_views(
         steps_mm = corner_distances_mm(some[:, None], some[None])
         order, path_mm = shortest_path(steps_mm, None if from_start is None else from_start[chosen])
     scale, least = 1.0, 0.0
-    if asked.want == "confidence" and model is not None:
+    if settings.want == "confidence" and model is not None:
         scale, least = 1.0 - model.black_ms_ssim, model.black_ms_ssim
     return ViewPlan(
         poses=scene.poses_as_tracked(candidates[np.array(chosen, np.int64)[order]]),

@@ -66,21 +66,21 @@ class FrameOfPage:
     panels: tuple[Panel, ...]
 
 
-def frames_of_page(chosen: Sweep, kinds: Sequence[str], shown: Sequence[Shown]) -> list[FrameOfPage]:
-    """Each frame of the chosen ones with its kind; all of `shown` hold as many frames."""
-    found = []
+def frames_of_page(chosen: Sweep, kinds: Sequence[str], columns: Sequence[Shown]) -> list[FrameOfPage]:
+    """Each frame of the chosen ones with its kind; all of `columns` hold as many frames."""
+    page_frames = []
     for row, kind in enumerate(kinds):
         truth = (chosen.images[row] / 255.0).astype(np.float32)
         panels = [Panel("truth", _address(truth, chosen), None, "")]
-        for one in shown:
+        for one in columns:
             frame = one.frames[row]
             difference, note = None, ""
             if one.psnr_db is not None:
                 difference = _address(np.minimum(np.abs(frame - truth) * DIFFERENCE_GAIN, 1.0), chosen)
                 note = f"{one.psnr_db[row]:.2f} dB"
             panels.append(Panel(one.title, _address(frame, chosen), difference, note))
-        found.append(FrameOfPage(int(chosen.frame_numbers[row]), kind, tuple(panels)))
-    return found
+        page_frames.append(FrameOfPage(int(chosen.frame_numbers[row]), kind, tuple(panels)))
+    return page_frames
 
 
 def telling_places(evaluation: Evaluation) -> dict[int, str]:
@@ -164,15 +164,15 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
 def environment(*packages: str) -> Environment:
     """The templates of these packages, and those that all pages share; with what all of them use."""
     loaders = [PackageLoader(package) for package in (*packages, __package__)]
-    made = Environment(loader=ChoiceLoader(loaders), autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    templates = Environment(loader=ChoiceLoader(loaders), autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     headings = [metric.heading for metric in METRICS]
-    made.globals |= {"version": __version__, "gain": DIFFERENCE_GAIN, "headings": headings}
-    return made
+    templates.globals |= {"version": __version__, "gain": DIFFERENCE_GAIN, "headings": headings}
+    return templates
 
 
 def _facts(page: ScenePage) -> dict[str, str]:
     scene, facts = page.scene, DatasetFacts.of(page.dataset)
-    found = {
+    entries = {
         **({} if page.scene_name is None else {"Scene": page.scene_name}),
         "Training frames": f"{facts.train_frames}",
         "Held-out frames": f"{facts.val_frames}",
@@ -181,11 +181,11 @@ def _facts(page: ScenePage) -> dict[str, str]:
         "Intensity": scene.info.intensity,
     }
     if page.course is not None:
-        found["Training"] = (
+        entries["Training"] = (
             f"{scene.info.training['steps']:,} steps in {page.course.seconds:.0f} s, "
             f"{1000.0 * page.course.step_s:.0f} ms a step"
         )
-    return {**found, "Machine": page.machine}
+    return {**entries, "Machine": page.machine}
 
 
 def _pictures(page: ScenePage) -> list[FrameOfPage]:

@@ -34,14 +34,14 @@ def line_style(place: int) -> dict[str, Any]:
 
 
 def make_figure(count: int, size: tuple[float, float], *, columns: int) -> tuple[Figure, list[Axes]]:
-    made = Figure(figsize=size, layout="constrained")
-    grid = np.atleast_1d(made.subplots(-(-count // columns), columns))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = np.atleast_1d(figure.subplots(-(-count // columns), columns))
     axes: list[Axes] = list(grid.ravel())
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="y", color="#e5e9ed", linewidth=0.8)
         axis.tick_params(labelsize=9)
-    return made, axes
+    return figure, axes
 
 
 def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:

@@ -28,10 +28,10 @@ class CorrectionSizes:
         tracked, corrections, rest = scene.training_poses, scene.pose_corrections, scene.rest_poses
         if corrections is None and rest is None:
             return None
-        told = tracked if corrections is None else np.linalg.inv(corrections) @ tracked
+        tracker_poses = tracked if corrections is None else np.linalg.inv(corrections) @ tracked
         trained = tracked if rest is None else rest
-        shifts = np.linalg.norm(trained[:, :3, 3] - told[:, :3, 3], axis=1)
-        return cls(shifts, np.degrees(turn_angles_rad(trained[:, :3, :3], told[:, :3, :3])))
+        shifts = np.linalg.norm(trained[:, :3, 3] - tracker_poses[:, :3, 3], axis=1)
+        return cls(shifts, np.degrees(turn_angles_rad(trained[:, :3, :3], tracker_poses[:, :3, :3])))
 
     def to_dict(self) -> dict[str, Any]:
         return {"shift_mm": self.shift_mm.tolist(), "turn_deg": self.turn_deg.tolist()}

@@ -121,7 +121,7 @@ def path_row(name: str, on_path: FrameMetrics) -> Row:
 def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:
     """One row a method with its place by each metric, and the mean of them; the first of each column marked."""
     ranks = rank(evaluations)
-    means = {name: f"{found.mean:.2f}" for name, found in ranks.items()}
+    means = {name: f"{ranking.mean:.2f}" for name, ranking in ranks.items()}
     best = min(means.values(), key=float, default="")
     return [
         Row(name, [*((str(place), place == 1) for place in places.by_metric.values()), (mean, mean == best)])
@@ -143,12 +143,12 @@ def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[
 
 def speckle_summaries(evaluations: Mapping[str, Evaluation]) -> dict[str, SpeckleSummary]:
     """By what was measured: each method, and after it the same with natural speckle where that is known."""
-    found = {}
+    summaries = {}
     for name, evaluation in evaluations.items():
-        found[name] = evaluation.speckle
+        summaries[name] = evaluation.speckle
         if evaluation.natural is not None:
-            found[f"{name}, natural speckle"] = evaluation.natural
-    return found
+            summaries[f"{name}, natural speckle"] = evaluation.natural
+    return summaries
 
 
 SPECKLE_COLUMNS = ("contrast", "axial, mm", "lateral, mm", "axial gradient", "lateral gradient")

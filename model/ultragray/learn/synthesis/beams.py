@@ -71,8 +71,8 @@ class Losses:
         return self.low_mm + CELL_MM * (np.array(self.seen.shape) - 1)
 
     def shows(self, points: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]
-        shown: BoolArray = self._at(points, self.seen) > 1e-6
-        return shown
+        is_seen: BoolArray = self._at(points, self.seen) > 1e-6
+        return is_seen
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm -> [N], [N]
         """Decibels lost, and −log T."""
@@ -88,11 +88,11 @@ def interpolated(field: npt.NDArray[Any], places: FloatArray) -> FloatArray:  # 
     places = np.clip(places, 0.0, last)
     first = np.minimum(places.astype(np.int64), np.maximum(last - 1, 0))
     share = places - first
-    found = np.zeros(len(places), field.dtype)
+    values = np.zeros(len(places), field.dtype)
     for corner in np.argwhere(np.ones((2, 2, 2))):
         weight = np.where(corner > 0, share, 1.0 - share).prod(axis=1)
-        found += weight.astype(field.dtype) * field[tuple(np.minimum(first + corner, last).T)]
-    return found
+        values += weight.astype(field.dtype) * field[tuple(np.minimum(first + corner, last).T)]
+    return values
 
 
 def losses(space: BodySpace, recipe: SceneRecipe, poses: FloatArray) -> Losses:  # poses [P, 4, 4] mm
@@ -108,8 +108,8 @@ def losses(space: BodySpace, recipe: SceneRecipe, poses: FloatArray) -> Losses: 
         points = _along_lines(probe, poses[place])  # [R, W, 3]
         number = space.number_at(points.reshape(-1, 3)).reshape(points.shape[:2])
         lost = np.cumsum(per_step[number], axis=0) - 0.5 * per_step[number]
-        shown = np.maximum(grey[number] - lost / recipe.dynamic_range_db, DARK)
-        ended = np.maximum(per_step[number], 0.0) / (recipe.dynamic_range_db * shown)
+        brightness = np.maximum(grey[number] - lost / recipe.dynamic_range_db, DARK)
+        ended = np.maximum(per_step[number], 0.0) / (recipe.dynamic_range_db * brightness)
         depth = np.cumsum(ended, axis=0) - 0.5 * ended
         cells = np.rint((points - low) / CELL_MM).astype(np.int64)
         inside = ((cells >= 0) & (cells < shape)).all(axis=-1)

@@ -57,16 +57,16 @@ def with_labels_of(start: GaussianScene, scene: GaussianScene, sweep: Sweep) -> 
     index = cv2.flann.Index(means_mm(start).astype(np.float32), {"algorithm": 4, "leaf_max_size": 16})
     nearest, _ = index.knnSearch(places, 1, params={"checks": -1})
     labels = start.labels.cpu().numpy()[nearest[:, 0]]
-    made = np.isin(labels, start.info.made_labels) & ~shown_by(sweep, places.astype(np.float64))
-    return with_labels(scene, labels, start.info.label_names, made)
+    unrecorded = np.isin(labels, start.info.made_labels) & ~shown_by(sweep, places.astype(np.float64))
+    return with_labels(scene, labels, start.info.label_names, unrecorded)
 
 
 def shown_by(sweep: Sweep, places: FloatArray) -> BoolArray:  # [N, 3] mm -> [N]
     """The places that lie in the image of a frame, or nearly."""
-    found = np.zeros(len(places), bool)
+    is_shown = np.zeros(len(places), bool)
     for pose in sweep.poses:
         local = (places - pose[:3, 3]) @ pose[:3, :3]
         near = np.flatnonzero(np.abs(local[:, 1]) < SHOWN_MM)
         rows, columns = sweep.probe.image_coordinates(local[near, 0], local[near, 2])
-        found[near[(rows >= 0.0) & (rows <= 1.0) & (columns >= 0.0) & (columns <= 1.0)]] = True
-    return found
+        is_shown[near[(rows >= 0.0) & (rows <= 1.0) & (columns >= 0.0) & (columns <= 1.0)]] = True
+    return is_shown

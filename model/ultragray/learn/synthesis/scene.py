@@ -76,7 +76,7 @@ def scene_from_labels(
         ]
     )
     order = spatial_order(splats["means"])
-    told = recipe.recorded()
+    description = recipe.recorded()
     info = replace(
         builder.info,
         image_height=recipe.image_size,
@@ -85,7 +85,7 @@ def scene_from_labels(
         speckle=speckle_of(recipe),
         provenance={
             "parents": {},
-            "edits": [told],
+            "edits": [description],
             "made": list(range(1, len(names) + 1)),
         },
     )
@@ -134,7 +134,7 @@ class _Cubes:
         cubes = cubes[lost.shows(cubes)]
         around = np.stack(np.meshgrid(*3 * [[-0.75, 0.0, 0.75]], indexing="ij"), axis=-1).reshape(-1, 3)
         eighths = np.stack(np.meshgrid(*3 * [[-0.25, 0.25]], indexing="ij"), axis=-1).reshape(-1, 3)
-        found: list[tuple[FloatArray, FloatArray, ByteArray]] = []
+        levels: list[tuple[FloatArray, FloatArray, ByteArray]] = []
         while len(cubes):
             if side < 1.5 * spacing_mm:
                 numbers, mixed = space.number_at(cubes), np.zeros(len(cubes), bool)
@@ -143,12 +143,12 @@ class _Cubes:
                 sampled = space.number_at(places).reshape(len(cubes), len(around))
                 mixed, numbers = (sampled != sampled[:, :1]).any(axis=1), sampled[:, 0]
             kept = ~mixed & (numbers > 0)
-            found.append((cubes[kept], np.full(int(kept.sum()), side), numbers[kept]))
+            levels.append((cubes[kept], np.full(int(kept.sum()), side), numbers[kept]))
             cubes = (cubes[mixed][:, None] + side * eighths).reshape(-1, 3)
             side /= 2.0
-        self.middles = np.concatenate([one[0] for one in found])  # [N, 3] mm
-        self.sides = np.concatenate([one[1] for one in found])  # [N] mm
-        self.numbers = np.concatenate([one[2] for one in found])  # [N] of bodies
+        self.middles = np.concatenate([one[0] for one in levels])  # [N, 3] mm
+        self.sides = np.concatenate([one[1] for one in levels])  # [N] mm
+        self.numbers = np.concatenate([one[2] for one in levels])  # [N] of bodies
 
     @classmethod
     def about(cls, count: int, space: BodySpace, lost: Losses) -> _Cubes:
@@ -192,24 +192,24 @@ class _Builder:
 
         def distance(points: FloatArray) -> FloatArray:  # of a plane that is blurred so; mm, negative inside
             inside = interpolated(share, (points - self._lost.low_mm) / self._voxel_mm)
-            found = torch.special.ndtri(torch.from_numpy(inside).double().clamp(1e-6, 1.0 - 1e-6))
-            away: FloatArray = -self._blur_mm * found.numpy()
+            deviations = torch.special.ndtri(torch.from_numpy(inside).double().clamp(1e-6, 1.0 - 1e-6))
+            away: FloatArray = -self._blur_mm * deviations.numpy()
             return away
 
         middles, sides = self._cubes.middles[own], self._cubes.sides[own]
         finest = sides < 1.5 * self._cubes.spacing_mm
         filled = self._filled(number, middles, sides)
         inner = {name: tensor[torch.from_numpy(~finest)] for name, tensor in filled.items()}
-        found = [(inner, number)] if (~finest).any() else []
+        parts = [(inner, number)] if (~finest).any() else []
         if finest.any():
             outer = {name: tensor[torch.from_numpy(finest)] for name, tensor in filled.items()}
             scene = clipped(GaussianScene.from_splats(outer, info=self.info), distance, SHARPNESS)
             if scene is not None:
-                found.append(({name: raw.detach() for name, raw in scene.splats.items()}, number))
+                parts.append(({name: raw.detach() for name, raw in scene.splats.items()}, number))
             surface = self._surface(number, middles[finest], distance)
             if surface is not None:
-                found.append((surface, number))
-        return found
+                parts.append((surface, number))
+        return parts
 
     def _grey(self, echo_db: float) -> float:
         return min(max(self._recipe.level + echo_db / self._recipe.dynamic_range_db, 0.0), BRIGHTEST)
@@ -217,20 +217,20 @@ class _Builder:
     def _seen(self, grey: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The echo that shows a grey level as physics has it, and B-mode without texture (see `beams`)."""
         lost_db, depth = self._lost.at(points)
-        shown = np.clip(grey - lost_db / self._recipe.dynamic_range_db, 0.0, BRIGHTEST)
-        lit = np.clip(2.0 * shown / np.maximum(grey, 1e-3), 0.0, 1.0)  # in a shadow the echo is the tissue's own
-        echo = lit * shown * np.exp(np.minimum(depth, 20.0)) + (1.0 - lit) * grey
-        return np.minimum(echo, np.minimum(MOST_BRIGHTENED * grey, BRIGHTEST)), shown
+        bmode = np.clip(grey - lost_db / self._recipe.dynamic_range_db, 0.0, BRIGHTEST)
+        lit = np.clip(2.0 * bmode / np.maximum(grey, 1e-3), 0.0, 1.0)  # in a shadow the echo is the tissue's own
+        echo = lit * bmode * np.exp(np.minimum(depth, 20.0)) + (1.0 - lit) * grey
+        return np.minimum(echo, np.minimum(MOST_BRIGHTENED * grey, BRIGHTEST)), bmode
 
     def _filled(self, number: int, middles: FloatArray, sides: FloatArray) -> dict[str, Tensor]:
         recipe, tissue = self._recipe, self._space.bodies[number - 1].acoustics
         count = len(middles)
         shaken = middles + 0.1 * sides[:, None] * self._random.normal(size=(count, 3))
         grey = np.full(count, self._grey(tissue.echo_db))
-        echo, shown = self._seen(grey, shaken)
+        echo, bmode = self._seen(grey, shaken)
         echo = echo + GRAIN * tissue.texture_db / recipe.dynamic_range_db * self._random.normal(size=count)
         excess_db = 2.0 * recipe.frequency_mhz * max(tissue.attenuation - recipe.compensated, 0.0)  # per cm
-        rates = excess_db / (recipe.dynamic_range_db * np.maximum(shown, DARK))  # −d log T per cm
+        rates = excess_db / (recipe.dynamic_range_db * np.maximum(bmode, DARK))  # −d log T per cm
         ended = np.zeros(count)  # 1 − τ
         for side in np.unique(sides):
             here = sides == side
@@ -333,15 +333,15 @@ def turned(vectors: FloatArray, before: FloatArray, after: FloatArray) -> FloatA
     both = before + after
     half = 0.5 * (both * both).sum(axis=1, keepdims=True)
     share = (both * vectors).sum(axis=1, keepdims=True) / np.maximum(half, 1e-9)
-    found: FloatArray = vectors - share * both + 2.0 * (before * vectors).sum(axis=1, keepdims=True) * after
-    return found
+    result: FloatArray = vectors - share * both + 2.0 * (before * vectors).sum(axis=1, keepdims=True) * after
+    return result
 
 
 def layers_of(share: FloatArray) -> IntArray:  # [N] -> [N]
     """How many layers of Gaussians give a surface such a share of all weights there; MOST_LAYERS at most."""
     needed = share / (1.0 - share).clip(1e-6) * _OF_BODIES / _OF_LAYER
-    found: IntArray = np.ceil(needed).clip(1, MOST_LAYERS).astype(int)
-    return found
+    counts: IntArray = np.ceil(needed).clip(1, MOST_LAYERS).astype(int)
+    return counts
 
 
 def surface_mm(recipe: SceneRecipe, contrast_db: FloatArray) -> FloatArray:  # [N] -> [N]
@@ -352,8 +352,8 @@ def surface_mm(recipe: SceneRecipe, contrast_db: FloatArray) -> FloatArray:  # [
     4/3·zₘ/√(2π), so that a surface is as bright in the mean.
     """
     reach_mm = pulse_mm(recipe) * np.sqrt(np.clip(contrast_db, 0.0, recipe.dynamic_range_db) * math.log(10.0) / 10.0)
-    found: FloatArray = 4.0 / 3.0 / math.sqrt(2.0 * math.pi) * reach_mm
-    return found
+    deviations: FloatArray = 4.0 / 3.0 / math.sqrt(2.0 * math.pi) * reach_mm
+    return deviations
 
 
 def pulse_mm(recipe: SceneRecipe) -> float:
@@ -382,5 +382,5 @@ def opacity_of(rates: FloatArray, spacing_cm: float) -> FloatArray:  # [N] per c
     opacities = np.linspace(0.0, 1.0, 101)
     lost = -np.log1p(-alpha * opacities[:, None]).mean(axis=1) * 4.5
     reached = 2.0 * math.pi * sigma**2 * lost / spacing_cm**3
-    found: FloatArray = np.interp(rates, reached, opacities)
-    return found
+    values: FloatArray = np.interp(rates, reached, opacities)
+    return values

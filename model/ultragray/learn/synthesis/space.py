@@ -60,10 +60,10 @@ class BodySpace:
                     layers.append(_Drawn(body, number, *body.shape.bounds_mm()))
 
         def number_at(points: FloatArray) -> ByteArray:
-            found = np.zeros(len(points), np.uint8)
+            at_points = np.zeros(len(points), np.uint8)
             for layer in layers:
-                layer.draw(points, found)
-            return found
+                layer.draw(points, at_points)
+            return at_points
 
         boxes = np.array([layer.bounds_mm() for layer in layers])
         resolution = min(layer.resolution_mm for layer in layers)
@@ -81,11 +81,11 @@ class _Voxels:
         self._first, self._last = filled.min(axis=0) - 0.5, filled.max(axis=0) + 0.5
         self.resolution_mm = float(abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0))
 
-    def draw(self, points: FloatArray, found: ByteArray) -> None:
+    def draw(self, points: FloatArray, numbers: ByteArray) -> None:
         places = np.rint(points @ self._to_voxels[:3, :3].T + self._to_voxels[:3, 3]).astype(np.int64)
         inside = np.flatnonzero(((places >= 0) & (places < self._numbers.shape)).all(axis=1))
         here = self._numbers[tuple(places[inside].T)]
-        found[inside[here > 0]] = here[here > 0]
+        numbers[inside[here > 0]] = here[here > 0]
 
     def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
         corners = np.where(np.argwhere(np.ones((2, 2, 2))) > 0, self._last, self._first)
@@ -103,11 +103,11 @@ class _Drawn:
     high_mm: FloatArray
     resolution_mm = SHAPES_RESOLUTION_MM
 
-    def draw(self, points: FloatArray, found: ByteArray) -> None:
+    def draw(self, points: FloatArray, numbers: ByteArray) -> None:
         assert self.body.shape is not None
         near = np.flatnonzero(((points >= self.low_mm) & (points <= self.high_mm)).all(axis=1))
         if len(near):
-            found[near[self.body.shape.distance_mm(points[near]) < 0.0]] = self.number
+            numbers[near[self.body.shape.distance_mm(points[near]) < 0.0]] = self.number
 
     def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
         return self.low_mm, self.high_mm
@@ -146,5 +146,5 @@ def _outside(is_air: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:  # [I, J]
     """The air of a slice that is connected to its border."""
     _, parts = cv2.connectedComponents(is_air.astype(np.uint8))
     border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
-    found: npt.NDArray[np.bool_] = is_air & np.isin(parts, np.unique(border[border > 0]))
-    return found
+    outside: npt.NDArray[np.bool_] = is_air & np.isin(parts, np.unique(border[border > 0]))
+    return outside

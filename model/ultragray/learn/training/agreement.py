@@ -114,35 +114,35 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     places = np.argsort(np.argsort(train.frame_numbers)) if known is None else known  # of each frame on the path
     order = np.argsort(places)
     on_path = places[: len(train)]
-    given = np.concatenate([part.poses for part in whole])[order]
-    ranges = path_ranges(train.probe.corners_from(given))
-    tracked_db, cleaned = judge.psnr_db(train.poses), without_noise(given, ranges)
+    tracker_poses = np.concatenate([part.poses for part in whole])[order]
+    ranges = path_ranges(train.probe.corners_from(tracker_poses))
+    tracked_db, cleaned = judge.psnr_db(train.poses), without_noise(tracker_poses, ranges)
     is_smoothed = judge.psnr_db(cleaned[on_path]) > tracked_db + LEAST_GAIN_DB
-    tracked = cleaned if is_smoothed else given  # in the tracker's frame, by the calibration that was given
-    found, delay_s = _Found.of(judge, tracked, ranges, on_path), 0.0
+    tracked = cleaned if is_smoothed else tracker_poses  # in the tracker's frame, by the calibration that was given
+    best, delay_s = _Path.of(judge, tracked, ranges, on_path), 0.0
     times_s = _times_of(whole)
     if times_s is not None and len(judge.frames) >= LEAST_DELAYED:
         ordered_s = times_s[order]
         earlier = partial(with_delay, tracked, ordered_s, ranges)
         likely_s = found_delay_s(lambda one_s: judge.psnr_db(earlier(one_s)[on_path]), ordered_s, ranges)
         if likely_s:
-            other = _Found.of(judge, earlier(likely_s), ranges, on_path)
-            if other.predicted_db >= found.predicted_db + GAIN_OF_DELAY_DB:
-                tracked, found, delay_s = earlier(likely_s), other, likely_s
-    noise = tracker_noise(given, ranges)
-    figures = judge.in_time_db(), tracked_db, noise, is_smoothed, delay_s, *found[1:]
-    if found.poses is given:
+            other = _Path.of(judge, earlier(likely_s), ranges, on_path)
+            if other.predicted_db >= best.predicted_db + GAIN_OF_DELAY_DB:
+                tracked, best, delay_s = earlier(likely_s), other, likely_s
+    noise = tracker_noise(tracker_poses, ranges)
+    figures = judge.in_time_db(), tracked_db, noise, is_smoothed, delay_s, *best[1:]
+    if best.poses is tracker_poses:
         return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if known is not None:
-        return AgreedPath(found.poses[on_path], found.poses[places[len(train) :]], tracked[on_path], *figures)
+        return AgreedPath(best.poses[on_path], best.poses[places[len(train) :]], tracked[on_path], *figures)
     held_out = val.poses
     if delay_s and val.times_s is not None:
         held_out = with_delay(held_out, val.times_s, sweep_ranges(val), delay_s)
-    carried = _carried(held_out, tracked, found.poses, ranges, train.probe)
-    return AgreedPath(found.poses[on_path], carried, tracked[on_path], *figures)
+    carried = _carried(held_out, tracked, best.poses, ranges, train.probe)
+    return AgreedPath(best.poses[on_path], carried, tracked[on_path], *figures)
 
 
-class _Found(NamedTuple):
+class _Path(NamedTuple):
     """A path by all that follows the delay."""
 
     poses: FloatArray  # [F, 4, 4] mm
@@ -153,30 +153,30 @@ class _Found(NamedTuple):
     crossing: Agreement | None
 
     @classmethod
-    def of(cls, judge: _Judge, tracked: FloatArray, ranges: Sequence[range], places: IntArray) -> _Found:
+    def of(cls, judge: _Judge, tracked: FloatArray, ranges: Sequence[range], places: IntArray) -> _Path:
         """From the poses [F, 4, 4] (mm) of a tracker without its noise; training frames have these places on them."""
         train = judge.sweep
-        found, found_db = tracked, judge.psnr_db(tracked[places])
-        calibration = found_calibration(replace(train, poses=found[places]), sweep_ranges(train))
+        path, path_db = tracked, judge.psnr_db(tracked[places])
+        calibration = found_calibration(replace(train, poses=path[places]), sweep_ranges(train))
         if not np.array_equal(calibration, np.eye(4)):
-            if (db := judge.psnr_db((found @ calibration)[places])) >= found_db - LEAST_GAIN_DB:
-                found, found_db = found @ calibration, db
+            if (db := judge.psnr_db((path @ calibration)[places])) >= path_db - LEAST_GAIN_DB:
+                path, path_db = path @ calibration, db
             else:
                 calibration = np.eye(4)  # what makes neighbouring frames predict each other worse is none
-        shares = _found_shares(judge, found, ranges, places)
+        shares = _best_shares(judge, path, ranges, places)
         if shares != RIGID:
-            found = with_shares(found, ranges, train.probe, shares)
-            found_db = judge.psnr_db(found[places])
-        even = evened(found, ranges, train.probe)
+            path = with_shares(path, ranges, train.probe, shares)
+            path_db = judge.psnr_db(path[places])
+        even = evened(path, ranges, train.probe)
         db, is_known = judge.psnr_db(even[places]), len(judge.frames) >= LEAST_PREDICTED
-        if is_evened := is_known and db > found_db + GAIN_OF_EVENNESS_DB:
-            found, found_db = even, db
-        if (crossing := crossing_agreement(train, found, ranges, places)) is not None:
-            if (db := judge.psnr_db((found @ crossing.motions)[places])) >= found_db - LOSS_OF_CROSSING_DB:
-                found, found_db = found @ crossing.motions, db
+        if is_evened := is_known and db > path_db + GAIN_OF_EVENNESS_DB:
+            path, path_db = even, db
+        if (crossing := crossing_agreement(train, path, ranges, places)) is not None:
+            if (db := judge.psnr_db((path @ crossing.motions)[places])) >= path_db - LOSS_OF_CROSSING_DB:
+                path, path_db = path @ crossing.motions, db
             else:
                 crossing = None
-        return cls(found, found_db, calibration, shares, is_evened, crossing)
+        return cls(path, path_db, calibration, shares, is_evened, crossing)
 
 
 def _times_of(parts: Sequence[Sweep]) -> FloatArray | None:  # [F] s
@@ -185,7 +185,7 @@ def _times_of(parts: Sequence[Sweep]) -> FloatArray | None:  # [F] s
     return np.concatenate(times) if len(times) == len(parts) else None
 
 
-def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:
+def _best_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:
     """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little, or where
     few frames can be predicted, and where passes that cross contradict them.
 
@@ -246,11 +246,11 @@ def evened(poses: FloatArray, ranges: Sequence[range], probe: Probe) -> FloatArr
     weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / EVEN_FRAMES))
 
     def slow(steps: FloatArray) -> FloatArray:  # [N, 6] -> [N, 6]
-        found = steps.copy()
+        smooth = steps.copy()
         for number in _ACROSS:
             longer = np.pad(steps[:, number], reach, mode="edge")
-            found[:, number] = np.convolve(longer, weights / weights.sum(), mode="valid")
-        return found
+            smooth[:, number] = np.convolve(longer, weights / weights.sum(), mode="valid")
+        return smooth
 
     return _with_steps(poses, ranges, probe, slow)
 
@@ -264,7 +264,7 @@ def _with_steps(
     middle of all images and their mean orientation stay for each sweep.
     """
     middle = probe.corners_mm().mean(axis=0)
-    found = poses.copy()
+    paths = poses.copy()
     for frames in ranges:
         own = poses[frames.start : frames.stop]
         if len(own) < 2:
@@ -279,8 +279,8 @@ def _with_steps(
             moved[place + 1] = moved[place] @ motion
         turn = mean_axes(own @ np.linalg.inv(moved))
         from_middle, to_middle = ((path[:, :3, :3] @ middle + path[:, :3, 3]).mean(axis=0) for path in (moved, own))
-        found[frames.start : frames.stop] = transforms_of(turn, to_middle - turn @ from_middle) @ moved
-    return found
+        paths[frames.start : frames.stop] = transforms_of(turn, to_middle - turn @ from_middle) @ moved
+    return paths
 
 
 def _carried(
@@ -294,7 +294,7 @@ def _carried(
     corners, middle = probe.corners_from(before), np.append(probe.corners_mm().mean(axis=0), 1.0)
     motions = after @ np.linalg.inv(before)
     sweep_of = np.repeat(np.arange(len(ranges)), [len(frames) for frames in ranges])
-    found = poses.copy()
+    new_poses = poses.copy()
     for place, own in enumerate(probe.corners_from(poses)):
         distances = corner_distances_mm(corners, own)
         nearest = int(distances.argmin())
@@ -304,9 +304,9 @@ def _carried(
         both = motions[[nearest, other]]
         there = (both @ poses[place] @ middle)[:, :3]
         turn = blended(both[:1, :3, :3], both[1:, :3, :3], np.array([share]))[0]
-        found[place, :3, :3] = turn @ poses[place, :3, :3]
-        found[place, :3, 3] = (1.0 - share) * there[0] + share * there[1] - found[place, :3, :3] @ middle[:3]
-    return found
+        new_poses[place, :3, :3] = turn @ poses[place, :3, :3]
+        new_poses[place, :3, 3] = (1.0 - share) * there[0] + share * there[1] - new_poses[place, :3, :3] @ middle[:3]
+    return new_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +348,7 @@ class _Judge:
         return np.array([self._predicted_db(poses, inverses, frame, reach) for frame in frames])
 
     def _predicted_db(self, poses: FloatArray, inverses: FloatArray, frame: int, reach: int) -> float:
-        local, shown = self._points(frame)
+        local, own = self._points(frame)
         values, distances = np.zeros((2, len(local))), np.full((2, len(local)), np.inf)
         for side, beside in enumerate((frame - reach, frame + reach)):
             onto = inverses[beside] @ poses[frame]
@@ -359,13 +359,13 @@ class _Judge:
                 distances[side, np.flatnonzero(inside)[seen_by_frame(self.marks, 0, points)[1] > 0.0]] = np.inf
         predicted = blend_by_distance(values, distances)
         known = ~np.isnan(predicted)
-        return _psnr_db(predicted[known], shown[known])
+        return _psnr_db(predicted[known], own[known])
 
     def crossing_db(self, poses: FloatArray) -> float | None:  # [F, 4, 4] mm
         """Of the pixels that frames of other passes show, too, as the nearest of those does; None where few are."""
         inverses, normals = np.linalg.inv(poses), poses[:, :3, 1]
         offsets = np.einsum("fi,fi->f", normals, poses[:, :3, 3])
-        predicted, shown = [], []
+        predicted, actual = [], []
         for frame in self.frames[spread_places(len(self.frames), CROSSING_FRAMES)]:
             local, own = (some[:CROSSING_PIXELS] for some in self._points(frame))
             places = local @ poses[frame, :3, :3].T + poses[frame, :3, 3]
@@ -377,20 +377,20 @@ class _Judge:
                 points = places[some] @ onto[:3, :3].T + onto[:3, 3]
                 inside, values = seen_by_frame(self.sweep, beside, points, interpolated_sharply)
                 predicted.append(values)
-                shown.append(own[some][inside])
-        if sum(map(len, shown)) < LEAST_CROSSING:
+                actual.append(own[some][inside])
+        if sum(map(len, actual)) < LEAST_CROSSING:
             return None
-        return _psnr_db(np.concatenate(predicted), np.concatenate(shown))
+        return _psnr_db(np.concatenate(predicted), np.concatenate(actual))
 
     def in_time_db(self) -> float:
         """Of the pixels as blends of the same pixels of the two frames, by their times."""
-        times, found = frame_times(self.sweep), []
+        times, psnrs_db = frame_times(self.sweep), []
         for frame in self.frames:
-            before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
+            before, middle, after = (self._values(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
             span = times[frame + 1] - times[frame - 1]
             share = (times[frame] - times[frame - 1]) / span if span > 0.0 else 0.5
-            found.append(_psnr_db(blend_in_time(before, after, float(np.clip(share, 0.0, 1.0))), shown))
-        return float(np.mean(found))
+            psnrs_db.append(_psnr_db(blend_in_time(before, after, float(np.clip(share, 0.0, 1.0))), middle))
+        return float(np.mean(psnrs_db))
 
     def _points(self, frame: int) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm, [N]
         """Pixels of a frame, in the frame of its probe, and what it shows there; kept for the next path."""
@@ -398,7 +398,7 @@ class _Judge:
             rows, columns = self._pixels(frame)
             sweep = self.sweep
             local = sweep.probe.points_mm((rows + 0.5) / sweep.height, (columns + 0.5) / sweep.width)
-            self._known_points[frame] = local, self._shown(frame, rows, columns)
+            self._known_points[frame] = local, self._values(frame, rows, columns)
         return self._known_points[frame]
 
     def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns
@@ -410,9 +410,9 @@ class _Judge:
         beside = self.marks.images[0, rows, columns] == 0
         return rows[beside], columns[beside]
 
-    def _shown(self, frame: int, rows: IntArray, columns: IntArray) -> FloatArray:  # [N]
-        shown: FloatArray = self.sweep.images[frame, rows, columns].astype(np.float64)
-        return shown
+    def _values(self, frame: int, rows: IntArray, columns: IntArray) -> FloatArray:  # [N]
+        values: FloatArray = self.sweep.images[frame, rows, columns].astype(np.float64)
+        return values
 
 
 def _marks_of(sweep: Sweep) -> Sweep | None:

@@ -127,21 +127,21 @@ def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # 
         ratio = float(RATIOS[costs.argmin()])  # the likeliest q/r where r is the noise
         for frames in _long_enough(ranges):
             cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
-    found = poses.copy()
+    clean_poses = poses.copy()
     for frames in ranges:
-        found[frames, :3, 3] = cleaned[frames, :3] @ mean_axes(poses[frames]).T
-    found[:, :3, :3] @= rotations_of(np.radians(cleaned[:, 3:] - coordinates[:, 3:]))
-    return found
+        clean_poses[frames, :3, 3] = cleaned[frames, :3] @ mean_axes(poses[frames]).T
+    clean_poses[:, :3, :3] @= rotations_of(np.radians(cleaned[:, 3:] - coordinates[:, 3:]))
+    return clean_poses
 
 
 def _coordinates(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 6] mm, degrees
-    found = np.zeros((len(poses), _NUMBERS))
+    coordinates = np.zeros((len(poses), _NUMBERS))
     for frames in ranges:
         own = poses[frames]
         turns = turns_of(own[:-1, :3, :3].transpose(0, 2, 1) @ own[1:, :3, :3])
-        found[frames, :3] = own[:, :3, 3] @ mean_axes(own)
-        found[frames[1:], 3:] = np.degrees(turns.cumsum(axis=0))
-    return found
+        coordinates[frames, :3] = own[:, :3, 3] @ mean_axes(own)
+        coordinates[frames[1:], 3:] = np.degrees(turns.cumsum(axis=0))
+    return coordinates
 
 
 def _long_enough(ranges: Sequence[range]) -> list[range]:
@@ -336,8 +336,8 @@ def found_calibration(sweep: Sweep, ranges: Sequence[range]) -> FloatArray:  # [
     if not crossing:
         return np.eye(4)
     sides = (_portion(sweep, sweep.poses, np.concatenate(part)) for part in (crossing, ranges[:1]))
-    found = _CalibrationMatch(*sides).climb(CALIBRATION_LEVELS)
-    return np.eye(4) if found is None else found
+    calibration = _CalibrationMatch(*sides).climb(CALIBRATION_LEVELS)
+    return np.eye(4) if calibration is None else calibration
 
 
 class _CalibrationMatch(_Match):
@@ -399,9 +399,9 @@ def _climbed(score: Callable[[FloatArray], float], start: FloatArray, level: Lev
 def detail(sweep: Sweep, blur: float, around: float) -> HalfArray:  # [F, H, W]
     """Structure wider than one standard deviation and narrower than the other, in pixels."""
     details = np.empty(sweep.images.shape, np.float16)
-    for image, found in zip(sweep.images, details, strict=True):
+    for image, target in zip(sweep.images, details, strict=True):
         grey = image / np.float32(255.0)
-        found[:] = _blurred(grey, blur) - _blurred(grey, around)
+        target[:] = _blurred(grey, blur) - _blurred(grey, around)
     return details
 
 

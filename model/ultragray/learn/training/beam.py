@@ -27,9 +27,9 @@ class TrainedBeam:
     """
 
     def __init__(self, config: TrainingConfig, probe: Probe) -> None:
-        self._given, self._config = config.given_beam, config
+        self._known_beam, self._config = config.given_beam, config
         self._length_mm = length = probe.scan_line_length_mm
-        thickness, focus, depth_of_field = (self._given or ElevationBeam(START_MM)).numbers
+        thickness, focus, depth_of_field = (self._known_beam or ElevationBeam(START_MM)).numbers
         if math.isinf(depth_of_field):
             focus, depth_of_field = 0.5 * length, length
         start = math.log(thickness), focus / length, math.log(depth_of_field)
@@ -43,7 +43,7 @@ class TrainedBeam:
     def numbers(self) -> ElevationBeam | Tensor | None:
         """The beam as `render` takes it: differentiable where it is learned."""
         if not self._config.learn_beam:
-            return self._given
+            return self._known_beam
         thickness, focus, depth_of_field = self._raw.unbind()
         return torch.stack([thickness.exp(), focus * self._length_mm, depth_of_field.exp()])
 
@@ -61,14 +61,14 @@ class TrainedBeam:
 
     def found(self) -> ElevationBeam | None:
         if not self._config.learn_beam:
-            return self._given
+            return self._known_beam
         thickness, focus, depth_of_field = self._raw.tolist()
         return ElevationBeam(math.exp(thickness), focus * self._length_mm, math.exp(depth_of_field))
 
     def is_doubtful(self, frame_spacing_mm: float) -> bool:
         """Whether the learned thickness is below half the spacing of frames, which then cannot show it."""
-        found = self.found()
-        return self._config.learn_beam and found is not None and found.thickness_mm < 0.5 * frame_spacing_mm
+        beam = self.found()
+        return self._config.learn_beam and beam is not None and beam.thickness_mm < 0.5 * frame_spacing_mm
 
     def tensors(self) -> dict[str, Tensor]:
         if self._adam is None:

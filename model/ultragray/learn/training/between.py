@@ -87,17 +87,17 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         heights_mm = offsets[nearest[0]] @ pose[:3, 1] if len(nearest) else np.zeros(1)
         low, high = float(heights_mm.min()), float(heights_mm.max())
         if min(-low, high) > CROSSING * max(-low, high):  # evenly: not as frames of a tilt do, whose faces meet
-            found = nearest.tolist()
+            neighbours = nearest.tolist()
         else:
-            found = []
+            neighbours = []
             for side in (1, -1):
                 ahead = side * across
                 near = np.flatnonzero(candidates & (ahead > LEAST_ACROSS * distances))
                 if len(near):
-                    found.append(int(near[distances[near].argmin()]))
+                    neighbours.append(int(near[distances[near].argmin()]))
                 elif not ((ahead > 0) & (ahead < extent_mm) & ~beside).any():
                     alone.append((place, side))
-        pairs |= {(min(place, other), max(place, other)): float(distances[other]) for other in found}
+        pairs |= {(min(place, other), max(place, other)): float(distances[other]) for other in neighbours}
     used = {place for pair in pairs for place in pair}
     spacing_mm = float(np.median(list(pairs.values()))) if pairs else 0.0
     pairs |= {(place, place): 0.0 for place in range(len(sweep)) if place not in used}
@@ -150,11 +150,11 @@ def blend_in_space(
     else:
         inside &= (columns >= 0.0) & (columns <= 1.0)
     places = torch.stack([2.0 * columns - 1.0, 2.0 * rows - 1.0], dim=-1)
-    found = functional.grid_sample(sources, places, padding_mode="border", align_corners=False).reshape(images.shape)
+    values = functional.grid_sample(sources, places, padding_mode="border", align_corners=False).reshape(images.shape)
     weights = torch.where(inside, 1.0 / distances.clamp(min=ON_PLANE_MM), 0.0).reshape(images.shape)
     is_in = inside.reshape(images.shape)
-    blended = (weights * found).sum(dim=1) / weights.sum(dim=1).clamp(min=1e-9)
-    return Blend(blended, (found[:, 1] - found[:, 0]) * is_in.all(dim=1), is_in.any(dim=1))
+    blended = (weights * values).sum(dim=1) / weights.sum(dim=1).clamp(min=1e-9)
+    return Blend(blended, (values[:, 1] - values[:, 0]) * is_in.all(dim=1), is_in.any(dim=1))
 
 
 def _projected(
@@ -276,8 +276,8 @@ class ViewsBetween:
         """`count` views at places drawn by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
         poses = places.poses(self._sweep)
-        shown = self.shown if self._images.device.type == "cpu" else self.plainly_shown
-        return Views(places, poses, *shown(places, poses))
+        show = self.shown if self._images.device.type == "cpu" else self.plainly_shown
+        return Views(places, poses, *show(places, poses))
 
     def plainly_shown(self, places: Places, poses: FloatArray) -> tuple[Tensor, Tensor]:  # [V, H, W] both
         """The expected images of views and their weights, on any device: the definition of `shown`."""

@@ -146,8 +146,8 @@ def check_same_run(path: Path, header: CheckpointHeader, config: TrainingConfig,
             f"{path}: it belongs to another dataset, or another split of it (SHA-256 {header.dataset_sha256[:12]}…, "
             f"given {dataset_sha256[:12]}…)"
         )
-    stored, given = header.config.to_dict(), config.to_dict()
-    different = [name for name in stored if stored[name] != given[name] and name != "memory_gb"]
+    stored, settings = header.config.to_dict(), config.to_dict()
+    different = [name for name in stored if stored[name] != settings[name] and name != "memory_gb"]
     if different:
-        changes = ", ".join(f"{name} is {stored[name]!r} there, {given[name]!r} here" for name in different)
+        changes = ", ".join(f"{name} is {stored[name]!r} there, {settings[name]!r} here" for name in different)
         raise TrainingStateInvalid(f"{path}: it belongs to a run with other settings: {changes}", field=different[0])

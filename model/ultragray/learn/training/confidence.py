@@ -171,20 +171,20 @@ def one_sided(sweep: Sweep) -> list[Prediction]:
     A sweep of one or two frames has none.
     """
     neighbours, path = Neighbours(sweep, MOST_TARGETS), path_mm(sweep)
-    asked = []  # row, helpers, whether they are the nearest on a side
+    cases = []  # row, helpers, whether they are the nearest on a side
     for row, target in enumerate(neighbours.targets):
         for ahead in (path - path[target], path[target] - path):
             choices = (neighbours.helpers(row, ahead > beyond_mm) for beyond_mm in BEYOND_MM)
-            asked += [
+            cases += [
                 (row, helpers, not number) for number, helpers in enumerate(dict.fromkeys(choices)) if len(helpers) > 1
             ]
-    found = []
-    for first in range(0, len(asked), PREDICTED_AT_ONCE):
-        rows, helpers, nearest = zip(*asked[first : first + PREDICTED_AT_ONCE], strict=True)
+    predictions = []
+    for first in range(0, len(cases), PREDICTED_AT_ONCE):
+        rows, helpers, nearest = zip(*cases[first : first + PREDICTED_AT_ONCE], strict=True)
         targets = neighbours.targets[list(rows)].tolist()
-        for target, is_nearest, told in zip(targets, nearest, neighbours.predict(rows, helpers), strict=True):
-            found.append(Prediction(target, is_nearest, *told))
-    return found
+        for target, is_nearest, figures in zip(targets, nearest, neighbours.predict(rows, helpers), strict=True):
+            predictions.append(Prediction(target, is_nearest, *figures))
+    return predictions
 
 
 LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
@@ -238,12 +238,12 @@ def fit_support(
 ) -> Support:
     """The gain, at least 1, that holds for GAIN_QUANTILE of the frames; share and reach of the least squared error."""
     reached = (ms_ssim - black_ms_ssim) / ((1.0 - black_ms_ssim) * np.maximum(shares, LEAST_SHARE))
-    found = []
+    fits = []
     for reach_mm in REACHES_MM:
         near = within(measures.distance_mm, reach_mm)
         share = min(1.0, max(LEAST_SHARE, float(near @ shares) / max(float(near @ near), 1e-9)))
-        found.append((float(np.square(share * near - shares).sum()), share, float(reach_mm)))
-    _, share, reach_mm = min(found)
+        fits.append((float(np.square(share * near - shares).sum()), share, float(reach_mm)))
+    _, share, reach_mm = min(fits)
     return Support(max(1.0, float(np.quantile(reached, GAIN_QUANTILE))), share, reach_mm)
 
 
@@ -344,12 +344,12 @@ def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatAr
 
     Multiplicative updates (Richardson 1972, Lucy 1974), which keep every cₖ positive and always gain.
     """
-    found = np.full(terms.shape[1], 0.05)
+    variances = np.full(terms.shape[1], 0.05)
     sums = np.maximum(terms.T @ weights, 1e-12)
     for _ in range(ITERATIONS):
-        expected = np.maximum(terms @ found, 1e-9)
-        found = found * (terms.T @ (weights * squares / expected)) / sums
-    return found
+        expected = np.maximum(terms @ variances, 1e-9)
+        variances = variances * (terms.T @ (weights * squares / expected)) / sums
+    return variances
 
 
 def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]

@@ -81,7 +81,7 @@ def crossing_agreement(
     all_splines = _splines(ranges, max(KNOT_FRAMES * len(path) / len(sweep), len(path) / MOST_KNOTS))
     splines = all_splines[chosen]
     still = np.zeros((splines.shape[1], _NUMBERS))
-    if len(judged.seen(looked_at.images, looked_at.poses).shown) < LEAST_POINTS * POINTS:
+    if len(judged.seen(looked_at.images, looked_at.poses).values) < LEAST_POINTS * POINTS:
         return None
     coefficients = still
     for level in LEVELS:
@@ -107,13 +107,13 @@ def _splines(ranges: Sequence[range], spacing: float) -> FloatArray:  # [F, K]
         knots = np.arange(-1, intervals + 2)
         away = np.abs(np.linspace(0.0, intervals, len(frames))[:, None] - knots)
         blocks.append(np.where(away < 1.0, 2 / 3 - away**2 + away**3 / 2, np.maximum(2.0 - away, 0.0) ** 3 / 6))
-    found = np.zeros((sum(map(len, blocks)), sum(block.shape[1] for block in blocks)))
+    splines = np.zeros((sum(map(len, blocks)), sum(block.shape[1] for block in blocks)))
     row = column = 0
     for block in blocks:
         rows, columns = block.shape
-        found[row : row + rows, column : column + columns] = block
+        splines[row : row + rows, column : column + columns] = block
         row, column = row + rows, column + columns
-    return found
+    return splines
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class _Seen:
     points: FloatArray  # [Q, 3] mm
     frames: IntArray  # [3, Q] places: of the frame, and of the planes
     shares: FloatArray  # [3, Q] of their motions in that of the point past the planes: 1, −w₁, −w₂
-    shown: FloatArray  # [Q]
+    values: FloatArray  # [Q]
     predicted: FloatArray  # [Q]
 
 
@@ -149,7 +149,7 @@ class _Crossing:
     def correlation(self, details: Frames, twists: FloatArray) -> float:
         """Of what is shown and what is predicted, the frames moved by the twists [F, 6]."""
         seen = self.seen(details, self._sweep.poses @ self.motions(twists))
-        return float(np.corrcoef(seen.shown, seen.predicted)[0, 1])
+        return float(np.corrcoef(seen.values, seen.predicted)[0, 1])
 
     def improved(
         self, details: Frames, step_pixels: float, splines: FloatArray, coefficients: FloatArray
@@ -157,11 +157,11 @@ class _Crossing:
         """The coefficients after a step of Gauss–Newton; slopes are differences over `step_pixels` to either side."""
         poses = self._sweep.poses @ self.motions(splines @ coefficients)
         seen = self.seen(details, poses)
-        if len(seen.shown) < LEAST_POINTS * POINTS:
+        if len(seen.values) < LEAST_POINTS * POINTS:
             return coefficients  # the passes have been moved apart
         slopes, known = self._slopes(details, poses, seen, step_pixels * min(self._sweep.pixel_mm))
-        scale, offset = np.polyfit(seen.predicted, seen.shown, 1)
-        residuals = seen.shown - scale * seen.predicted - offset
+        scale, offset = np.polyfit(seen.predicted, seen.values, 1)
+        residuals = seen.values - scale * seen.predicted - offset
         deviation = max(float(residuals.std()), 1e-6)
         weights = known / np.maximum(1.0, np.abs(residuals) / (OUTLIER * deviation)) / deviation**2
         size = coefficients.size

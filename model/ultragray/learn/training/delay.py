@@ -31,20 +31,20 @@ def with_delay(
     delay_s: float,
 ) -> FloatArray:  # [F, 4, 4] mm
     """The poses a delay before the times of the frames, each sweep by itself; beyond its ends it goes on evenly."""
-    found = poses.copy()
+    delayed_poses = poses.copy()
     for frames in ranges:
         own, own_s = poses[frames.start : frames.stop], times_s[frames.start : frames.stop]
         if len(own) < 2:
             continue
-        asked_s = own_s - delay_s
-        first = np.clip(np.searchsorted(own_s, asked_s, side="right") - 1, 0, len(own) - 2)
+        earlier_s = own_s - delay_s
+        first = np.clip(np.searchsorted(own_s, earlier_s, side="right") - 1, 0, len(own) - 2)
         before, after = own[first], own[first + 1]
         spans_s = own_s[first + 1] - own_s[first]  # 0 of a time that comes twice
-        shares = np.divide(asked_s - own_s[first], spans_s, out=np.zeros(len(own)), where=spans_s > 0.0)
+        shares = np.divide(earlier_s - own_s[first], spans_s, out=np.zeros(len(own)), where=spans_s > 0.0)
         moved = before + shares[:, None, None] * (after - before)
         moved[:, :3, :3] = blended(before[:, :3, :3], after[:, :3, :3], shares)
-        found[frames.start : frames.stop] = moved
-    return found
+        delayed_poses[frames.start : frames.stop] = moved
+    return delayed_poses
 
 
 def found_delay_s(
@@ -56,14 +56,14 @@ def found_delay_s(
     steps_s = np.concatenate([np.diff(times_s[frames.start : frames.stop]) for frames in ranges])
     if not len(steps_s) or steps_s.min() <= 0.0:
         return 0.0
-    tried: dict[float, float] = {}
+    scores: dict[float, float] = {}
 
     def psnr_of(delay_s: float) -> float:
         if abs(delay_s) > MOST_S:
             return -np.inf
-        if delay_s not in tried:
-            tried[delay_s] = psnr_db(delay_s)
-        return tried[delay_s]
+        if delay_s not in scores:
+            scores[delay_s] = psnr_db(delay_s)
+        return scores[delay_s]
 
     best_s, usual_s = 0.0, float(np.median(steps_s))
     for step_s in usual_s * np.array(STEPS):

@@ -213,7 +213,7 @@ def shared_detail(sweep: Sweep) -> float:
     Detail is what an image loses when it is smoothed by a pixel. Pixels of a frame are projected onto the plane of the
     other along its normal; what lies beside it does not count, nor do frames without detail.
     """
-    pairs, found = neighbours_of(sweep).pairs, []
+    pairs, correlations = neighbours_of(sweep).pairs, []
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     for first, second in pairs[spread_places(len(pairs), COMPARED_PAIRS)]:
         random = np.random.default_rng(first)
@@ -223,8 +223,8 @@ def shared_detail(sweep: Sweep) -> float:
         inside, there = seen_by_frame(sweep, second, local @ onto[:3, :3].T + onto[:3, 3], _interpolated_detail)
         here = _interpolated_detail(sweep.images, first, rows[inside], columns[inside])
         if len(here) and here.std() * there.std() > 0.0:
-            found.append(float(np.corrcoef(here, there)[0, 1]))
-    return float(np.mean(found)) if found else 0.0
+            correlations.append(float(np.corrcoef(here, there)[0, 1]))
+    return float(np.mean(correlations)) if correlations else 0.0
 
 
 def _interpolated_detail(
@@ -260,12 +260,12 @@ FloatImage = npt.NDArray[np.float32]
 class Beam(NamedTuple):
     """The evidence of one frame."""
 
-    left: FloatImage  # [H, W] share of the beam, at most
+    share: FloatImage  # [H, W] share of the beam, at most
     echo: FloatImage  # [H, W] the smoothed brightness that the whole beam would have shown there
 
     @property
     def is_shadowed(self) -> npt.NDArray[np.bool_]:  # [H, W]
-        return self.left < SHADOWED
+        return self.share < SHADOWED
 
 
 class Shadows:
@@ -294,16 +294,16 @@ class Shadows:
         last = max(0, int(self._bright_rows[-1] - max(LEAST_LENGTH_MM / self._axial, LEAST_LENGTH * height)))
         below[last:] = below[last]  # too little is left of the line to tell
         at_face = below[: max(1, round(FACE_MM / self._axial))].max(axis=0)
-        left = np.clip(below / np.maximum(at_face, NO_CONTACT), 0.0, 1.0)
-        left[:, at_face < NO_CONTACT] = 1.0
-        echo = np.where(left < SPENT, 1.0, np.minimum(relative[0] / np.maximum(left, SPENT), 1.0))
-        return Beam(left, (self._usual[:, None] * echo).astype(np.float32))
+        share = np.clip(below / np.maximum(at_face, NO_CONTACT), 0.0, 1.0)
+        share[:, at_face < NO_CONTACT] = 1.0
+        echo = np.where(share < SPENT, 1.0, np.minimum(relative[0] / np.maximum(share, SPENT), 1.0))
+        return Beam(share, (self._usual[:, None] * echo).astype(np.float32))
 
     def pixels(self) -> npt.NDArray[np.bool_]:  # [F, H, W]
-        found = np.empty(self._sweep.images.shape, bool)
-        for place, pixels in enumerate(found):
+        shadows = np.empty(self._sweep.images.shape, bool)
+        for place, pixels in enumerate(shadows):
             pixels[:] = self.of(place).is_shadowed
-        return found
+        return shadows
 
     def _smooth(self, place: int) -> FloatImage:  # [H, W]
         sigmas = [max(0.5, mm / pixel) for mm, pixel in zip(SMOOTHING_MM, (self._lateral, self._axial), strict=True)]

@@ -91,8 +91,8 @@ class GrowingTrainer:
     """The Gaussians of a sweep that is still being recorded, and what trains them."""
 
     def __init__(self, name: str, probe: Probe, *, seed: int = 0, device: str = "cpu", backend: str = "auto") -> None:
-        self.name, self._probe, self._asked, self._backend = name, probe, device, backend
-        self._given = TrainingConfig(seed=seed, refine_poses="none")
+        self.name, self._probe, self._device_name, self._backend = name, probe, device, backend
+        self._settings = TrainingConfig(seed=seed, refine_poses="none")
         self._device = training_device(device, backend)
         self._generator = torch.Generator().manual_seed(seed)
         self._train: Sweep | None = None
@@ -163,13 +163,13 @@ class GrowingTrainer:
         with torch.no_grad():
             rates = self._schedule.rates(0)
             self._optimizer.step({name: self._caution * rate * one for name, one in rates.items()})
-            held = torch.where(self.step - self._born < FLOOR_STEPS, self._floor, 0.0)
-            least = least_sh0(held.to(self._device), config.intensity)
+            floor = torch.where(self.step - self._born < FLOOR_STEPS, self._floor, 0.0)
+            least = least_sh0(floor.to(self._device), config.intensity)
             project_sh0(self._parameters["sh0"], config.intensity, least)
         self.step += 1
-        if not math.isfinite(found := float(loss.detach())):
-            raise TrainingDiverged(f"training diverged in step {self.step}: the loss is {found}")
-        return found
+        if not math.isfinite(value := float(loss.detach())):
+            raise TrainingDiverged(f"training diverged in step {self.step}: the loss is {value}")
+        return value
 
     def scene(self, judgement: Judgement) -> GaussianScene:
         """The scene as it is, on the CPU, with what is known of where it holds."""
@@ -202,9 +202,9 @@ class GrowingTrainer:
         with torch.no_grad():
             for some, frames in parts:
                 truth = torch.from_numpy(some.images).float().div_(255.0)
-                for found in frame_metrics(frames["bmode"].detach().float().cpu(), truth):
+                for metrics in frame_metrics(frames["bmode"].detach().float().cpu(), truth):
                     place = next(places)
-                    psnr_db[place], ms_ssim[place] = found.psnr_db, found.ms_ssim
+                    psnr_db[place], ms_ssim[place] = metrics.psnr_db, metrics.ms_ssim
         return Judgement(psnr_db, ms_ssim)
 
     def is_worse(self, judgement: Judgement) -> bool:
@@ -229,13 +229,15 @@ class GrowingTrainer:
         detail, small ones would hide it: then steps are on some of the scan lines, others each time.
         """
         whole = PoseRefinement.of(dataset, "path")
-        other = GrowingTrainer(self.name, self._probe, seed=self._given.seed, device=self._asked, backend=self._backend)
+        other = GrowingTrainer(
+            self.name, self._probe, seed=self._settings.seed, device=self._device_name, backend=self._backend
+        )
         other._whole, other.judged = whole, self.judged
         train = whole.dataset.train
-        lines, left = divmod(train.width, DETAIL_LINES)
-        if not left and lines >= SSIM_WINDOW and shared_detail(train) >= SAME_DETAIL:
+        lines, remainder = divmod(train.width, DETAIL_LINES)
+        if not remainder and lines >= SSIM_WINDOW and shared_detail(train) >= SAME_DETAIL:
             other._size, other._every = (train.height, train.width), DETAIL_LINES
-            other._given = replace(other._given, batch_size=DETAIL_BATCH, views_between=1 / DETAIL_BATCH)
+            other._settings = replace(other._settings, batch_size=DETAIL_BATCH, views_between=1 / DETAIL_BATCH)
         other.add(*in_recorded_order(whole.dataset))
         return other
 
@@ -291,7 +293,7 @@ class GrowingTrainer:
         if not self._surveyed and not self.step:
             self._centre_mm = geometry.centre_mm
         self._geometry = replace(geometry, centre_mm=self._centre_mm)
-        self._config = self._given.resolved(self._geometry)
+        self._config = self._settings.resolved(self._geometry)
         self._neighbours = neighbours_of(train).without_ends()
         self._follow_probe: bool | None = None  # found again with the views between
         self._shadows = Shadows(train)
@@ -425,16 +427,16 @@ def _small_size(images: ByteArray) -> tuple[int, int]:  # [F, H, W]
     some = images[spread_places(len(images), SIZED_BY)].astype(np.float32)
     while some[0].size >= 4 * SMALL_PIXELS:
         count, height, width = some.shape
-        found = []
+        candidates = []
         for rows, columns in FOURS:
             small = height // rows, width // columns
             if height % rows == width % columns == 0 and min(small) >= SSIM_WINDOW:
                 fours = some.reshape(count, small[0], rows, small[1], columns)
                 hidden = float(fours.var(axis=(2, 4)).mean()) / (1.0 if rows == columns else FAR_LESS)
-                found.append((hidden, fours.mean(axis=(2, 4))))
-        if not found:
+                candidates.append((hidden, fours.mean(axis=(2, 4))))
+        if not candidates:
             break
-        some = min(found, key=lambda one: one[0])[1]
+        some = min(candidates, key=lambda one: one[0])[1]
     return some.shape[1], some.shape[2]
 
 

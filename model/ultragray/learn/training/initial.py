@@ -140,13 +140,13 @@ def _on_planes(
         for side in (0, 1):
             (own,) = np.nonzero(places.frames[:, side] == frame)
             pixels = rows[own], columns[own]
-            shown = sweep.images[frame][pixels] / 255.0
+            grey = sweep.images[frame][pixels] / 255.0
             if beam is None:
-                brightness[side, own] = shown
+                brightness[side, own] = grey
                 continue
-            left, echo, hidden = (values[pixels] for values in (beam.left, beam.echo, beam.is_shadowed))
-            lit = np.where(left < SPENT, echo, np.minimum(shown / np.maximum(left, SPENT), MOST_LIT * echo))
-            brightness[side, own] = np.where(hidden, lit, shown)
+            share, echo, hidden = (values[pixels] for values in (beam.share, beam.echo, beam.is_shadowed))
+            lit = np.where(share < SPENT, echo, np.minimum(grey / np.maximum(share, SPENT), MOST_LIT * echo))
+            brightness[side, own] = np.where(hidden, lit, grey)
             unshadowed[side, own] = np.where(hidden, echo, 0.0)
     nearer = (places.shares > 0.5).astype(np.int64), np.arange(count)
     return _Pixels(

@@ -81,8 +81,8 @@ def image_loss(
     images are mixed with their truth before, so that each pixel counts as much as its weight says. Where the images are
     float32 on the CPU, the C++ kernel computes it.
     """
-    given = (rendered, truth) if weights is None else (rendered, truth, weights)
-    if all(image.device.type == "cpu" and image.dtype == torch.float32 for image in given):
+    images = (rendered, truth) if weights is None else (rendered, truth, weights)
+    if all(image.device.type == "cpu" and image.dtype == torch.float32 for image in images):
         return kernel_image_loss(rendered, truth, texture, weights)
     return plain_image_loss(rendered, truth, texture, weights)
 

@@ -130,8 +130,8 @@ def comparison_bytes(dataset: Dataset, config: TrainingConfig) -> int:
 
 def available_bytes() -> int | None:
     """Memory that is left for this process: what is free, less where its control group allows less; None: unknown."""
-    found = [value for value in (_free_memory(), _left_in_group()) if value is not None]
-    return min(found) if found else None
+    limits = [value for value in (_free_memory(), _left_in_group()) if value is not None]
+    return min(limits) if limits else None
 
 
 def _free_memory() -> int | None:

@@ -241,8 +241,8 @@ def refine(
     largest = _largest_cm(grown["scales"])
     useful = (largest <= config.prune_above * scene_scale_cm) & (largest >= config.prune_below * scene_scale_cm)
     origin = torch.cat([kept, kept.new_full((len(useful) - len(kept),), -1)])
-    (left,) = torch.nonzero(useful, as_tuple=True)
-    order = left[spatial_order(grown["means"][left])]
+    (survivors,) = torch.nonzero(useful, as_tuple=True)
+    order = survivors[spatial_order(grown["means"][survivors])]
     parent = torch.cat([kept, duplicated, split, split])
     return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order], parent[order])
 

@@ -139,8 +139,8 @@ class PoseRefinement:
     """The poses of the training frames, as tracked and in the tissue at rest; `dataset`, the one to train from, has
     those at rest that the training begins with."""
 
-    def __init__(self, dataset: Dataset, told: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
-        self.dataset, self._told = dataset, told
+    def __init__(self, dataset: Dataset, tracker_poses: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
+        self.dataset, self._tracker_poses = dataset, tracker_poses
         self._trained: TrainedCorrections | None = None
         self._path: AgreedPath | None = None  # where poses at rest are others than as tracked
 
@@ -153,21 +153,21 @@ class PoseRefinement:
         frame has a correction of its own. With `none`, and where the poses are good (neighbours and sweeps agree), they
         stay and none is trained.
         """
-        found = cls(dataset, dataset.train.poses)
+        refinement = cls(dataset, dataset.train.poses)
         if mode in WITH_PATH and (path := agreed_path(dataset)) is not None:
-            found.dataset = path.of(dataset)
-            found._path = None if np.array_equal(path.train, path.tracked) else path
+            refinement.dataset = path.of(dataset)
+            refinement._path = None if np.array_equal(path.train, path.tracked) else path
         if mode in ("none", "path"):
-            return found
-        train = found.dataset.train
+            return refinement
+        train = refinement.dataset.train
         ranges = sweep_ranges(train)
         poses = train.poses.copy()
         for frames, motion in zip(ranges, register_sweeps(train, ranges), strict=True):
             poses[frames] = motion @ poses[frames]
-        if not np.array_equal(poses, found._told):
-            found.dataset = replace(found.dataset, train=replace(train, poses=poses))
-            found._trained = _TRAINED[mode](found.dataset.train, ranges)
-        return found
+        if not np.array_equal(poses, refinement._tracker_poses):
+            refinement.dataset = replace(refinement.dataset, train=replace(train, poses=poses))
+            refinement._trained = _TRAINED[mode](refinement.dataset.train, ranges)
+        return refinement
 
     @property
     def group_count(self) -> int:
@@ -188,10 +188,10 @@ class PoseRefinement:
         if self._trained is not None:
             at_rest = self._trained.all_motions() @ at_rest
         poses = at_rest if self._path is None else self._path.tracked
-        is_told = np.array_equal(poses, self._told)
+        is_unchanged = np.array_equal(poses, self._tracker_poses)
         return {
             "training_poses": poses,
-            "pose_corrections": None if is_told else poses @ np.linalg.inv(self._told),
+            "pose_corrections": None if is_unchanged else poses @ np.linalg.inv(self._tracker_poses),
             "rest_poses": None if self._path is None else at_rest,
         }
 

@@ -47,13 +47,13 @@ def choose_effort(dataset: Dataset, config: TrainingConfig, try_out: TryOut, fol
         return USUAL_EFFORT
     kept = np.setdiff1d(np.arange(len(dataset.train)), held_out)
     part = Dataset(dataset.name, train=dataset.train.select(kept), val=dataset.train.select(held_out))
-    tried = _Tried(dataset, config, folder)
+    trials = _Trials(dataset, config, folder)
 
     def measured(effort: float) -> FrameMetrics | None:
-        found = tried.metrics.get(effort) or try_out(part, replace(config, effort=effort, confidence=False))
-        if found is not None:
-            tried.add(effort, found)
-        return found
+        metrics = trials.metrics.get(effort) or try_out(part, replace(config, effort=effort, confidence=False))
+        if metrics is not None:
+            trials.add(effort, metrics)
+        return metrics
 
     chosen, best = USUAL_EFFORT, measured(USUAL_EFFORT)
     if best is None:
@@ -61,20 +61,20 @@ def choose_effort(dataset: Dataset, config: TrainingConfig, try_out: TryOut, fol
     for direction in OTHER_EFFORTS:
         for effort in direction if chosen == USUAL_EFFORT else ():
             try:
-                found = measured(effort)
+                metrics = measured(effort)
             except (MemoryExceeded, TrainingDiverged) as error:
                 log.warning("effort %g cannot be tried: %s", effort, error)
                 break
-            if found is None:
+            if metrics is None:
                 return None
-            if not found.is_better_than(best):
+            if not metrics.is_better_than(best):
                 break
-            chosen, best = effort, found
+            chosen, best = effort, metrics
     log.info("effort %g shows the frames left out best: %.2f dB", chosen, best.psnr_db)
     return chosen
 
 
-class _Tried:
+class _Trials:
     """What was found by effort; also in a file, where the run has a folder."""
 
     def __init__(self, dataset: Dataset, config: TrainingConfig, folder: Path | None) -> None:
@@ -92,8 +92,8 @@ class _Tried:
         if self._path is None:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        found = {str(effort): metrics.to_dict() for effort, metrics in self.metrics.items()}
-        write_whole(self._path, json.dumps({**self._run, "metrics": found}, indent=2) + "\n")
+        by_effort = {str(effort): metrics.to_dict() for effort, metrics in self.metrics.items()}
+        write_whole(self._path, json.dumps({**self._run, "metrics": by_effort}, indent=2) + "\n")
 
 
 FITTING = "fitting the confidence"
@@ -138,10 +138,10 @@ def train(
             f"{checkpoint}: there is an unfinished run: resume it, or remove {folder} to begin anew"
         )
     apart = _Apart(report, should_stop, device, backend, start)
-    given = config or TrainingConfig()
-    config = _with_effort(dataset, given, folder, resume, apart)
+    settings = config or TrainingConfig()
+    config = _with_effort(dataset, settings, folder, resume, apart)
     if config is None:
-        return Trainer(dataset, given, folder=None, device=device, backend=backend, start=start).scene()
+        return Trainer(dataset, settings, folder=None, device=device, backend=backend, start=start).scene()
     try:
         trainer = Trainer(dataset, config, folder=folder, device=device, backend=backend, start=start)
         if resume:

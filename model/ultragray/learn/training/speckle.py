@@ -179,17 +179,17 @@ class _Fit:
         assert plain is not None
         skewness = 0.0
         for _ in range(CORRECTIONS):
-            shown = self.statistics(self.with_speckle(model))
-            assert shown is not None
+            current = self.statistics(self.with_speckle(model))
+            assert current is not None
             widths: dict[str, Any] = {}
             for name, pixels_mm in self._pixels_mm.items():
-                own, wanted, without = (getattr(one, name) for one in (shown, truth, plain))
+                own, wanted, without = (getattr(one, name) for one in (current, truth, plain))
                 ratios = _width(wanted - without) / _width(own - without)
                 ratios = np.clip(np.where(np.isfinite(ratios), ratios, 1.0), 0.6, 1.6)
                 pixels = np.clip(getattr(model, f"{name}_mm") * ratios / pixels_mm, SMALLEST_PIXELS, LARGEST_PIXELS)
                 widths[f"{name}_mm"] = tuple(_limited(pixels * pixels_mm).tolist())
-            strength = _strength(model, truth, plain, shown)
-            skewness = float(np.clip(skewness + truth.skewness - shown.skewness, *SKEWNESS))
+            strength = _strength(model, truth, plain, current)
+            skewness = float(np.clip(skewness + truth.skewness - current.skewness, *SKEWNESS))
             looks, floor = looks_and_floor(skewness)
             model = with_cells(
                 replace(
@@ -211,36 +211,36 @@ def _limited(widths_mm: FloatArray) -> FloatArray:
 
 def _width(covariance: FloatArray) -> FloatArray:  # [BANDS, MAX_LAG + 1] -> [BANDS] pixels; NaN: not to be told
     """Where the correlation is a half, or where it would be if it were a Gaussian's."""
-    found = np.full(len(covariance), np.nan)
+    widths = np.full(len(covariance), np.nan)
     for band, own in enumerate(covariance):
         if own[0] <= 1e-7:
             continue
         correlation = own / own[0]
         below = np.flatnonzero(correlation < 0.5)
         if not len(below):
-            found[band] = MAX_LAG
+            widths[band] = MAX_LAG
         elif below[0] == 1:
-            found[band] = np.sqrt(np.log(2.0) / -np.log(np.clip(correlation[1], 1e-3, 0.5)))
+            widths[band] = np.sqrt(np.log(2.0) / -np.log(np.clip(correlation[1], 1e-3, 0.5)))
         else:
             before = below[0] - 1
-            found[band] = before + (correlation[before] - 0.5) / (correlation[before] - correlation[below[0]])
-    return found
+            widths[band] = before + (correlation[before] - 0.5) / (correlation[before] - correlation[below[0]])
+    return widths
 
 
-def _strength(model: SpeckleModel, truth: _Statistics, plain: _Statistics, shown: _Statistics) -> FloatArray:
+def _strength(model: SpeckleModel, truth: _Statistics, plain: _Statistics, current: _Statistics) -> FloatArray:
     """What is missing at each grey level; levels with few windows take that of their neighbours."""
-    missing, given = (np.square(one.deviation) - np.square(plain.deviation) for one in (truth, shown))
+    missing, present = (np.square(one.deviation) - np.square(plain.deviation) for one in (truth, current))
     known = (truth.counts > LEAST_WINDOWS / 4) & (plain.counts > LEAST_WINDOWS / 4)
-    ratios = np.sqrt(np.clip(missing / np.maximum(given, 1e-9), 0.0, 4.0))
+    ratios = np.sqrt(np.clip(missing / np.maximum(present, 1e-9), 0.0, 4.0))
     now = np.array(model.strength) * ratios
     weights = np.where(known, truth.counts, 0.0)
     beside = _SMOOTHING @ weights  # windows hold grey levels beside their own: alone, levels would swing
     smooth = _SMOOTHING @ (weights * now) / np.maximum(beside, 1e-9)
     levels = np.flatnonzero(known)
-    found = np.interp(np.arange(LEVELS), levels, smooth[levels]) if len(levels) else np.zeros(LEVELS)
+    strengths = np.interp(np.arange(LEVELS), levels, smooth[levels]) if len(levels) else np.zeros(LEVELS)
     if truth.black is not None:
-        found[0] = min(found[0], truth.black / _HALF_DEVIATION)
-    return np.clip(found, 0.0, 0.5)
+        strengths[0] = min(strengths[0], truth.black / _HALF_DEVIATION)
+    return np.clip(strengths, 0.0, 0.5)
 
 
 def looks_and_floor(skewness: float) -> tuple[float, float]:
@@ -290,7 +290,7 @@ def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: 
     rendered = torch.from_numpy(_rendered(scene, part, part.poses, backend))
     axes, wanted = sweep_axes(sweep.poses), windows.moments(images)
 
-    def shown(one: SpeckleModel) -> FloatArray:
+    def moments(one: SpeckleModel) -> FloatArray:
         return windows.moments(kernel_speckle(one, axes, part.probe, part.poses, rendered).numpy())
 
     bands = np.minimum((windows.depth * BANDS).astype(int), BANDS - 1)
@@ -298,7 +298,7 @@ def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: 
     widths = _limited(SLICES * float(np.mean(model.lateral_mm)))
     errors = np.full((len(widths), BANDS), np.inf)
     for place, width in enumerate(widths):
-        own = shown(with_cells(replace(model, elevation_mm=(float(width),) * BANDS), sweep))
+        own = moments(with_cells(replace(model, elevation_mm=(float(width),) * BANDS), sweep))
         for band in range(BANDS):
             some = (bands == band) & upright
             if some.sum() >= LEAST_PAIRS:
@@ -315,9 +315,9 @@ def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: 
     tilted = ~upright & (windows.elevation_mm < np.array(model.elevation_mm)[bands])
     if tilted.sum() < LEAST_PAIRS:
         return model
-    tried = [replace(model, wavenumber_per_mm=one) for one in (0.0, *WAVENUMBERS)]
-    left = [_error(windows.angle_deg[tilted], ANGLE_DEG, shown(one)[tilted], wanted[tilted]) for one in tried]
-    return tried[int(np.argmin(left))] if min(left) < CLEARLY * left[0] else model
+    models = [replace(model, wavenumber_per_mm=one) for one in (0.0, *WAVENUMBERS)]
+    losses = [_error(windows.angle_deg[tilted], ANGLE_DEG, moments(one)[tilted], wanted[tilted]) for one in models]
+    return models[int(np.argmin(losses))] if min(losses) < CLEARLY * losses[0] else model
 
 
 def frame_pairs(sweep: Sweep) -> IntArray:  # [P, 2]

@@ -49,8 +49,8 @@ def scene_poses(scene: GaussianScene, poses: Any) -> ScenePoses:  # [C, 4, 4] or
     exact = check_poses(poses)
     exact_cm = scene.poses_to_scene_cm(scene.poses_at_rest(exact))
     if isinstance(poses, Tensor) and poses.requires_grad and torch.is_grad_enabled():
-        made: Tensor = _Rigid.apply(poses, exact, exact_cm)  # type: ignore[no-untyped-call]
-        return made
+        poses_cm: Tensor = _Rigid.apply(poses, exact, exact_cm)  # type: ignore[no-untyped-call]
+        return poses_cm
     return exact_cm
 
 

@@ -351,9 +351,9 @@ def test_a_shadow_lasts_to_the_end_of_the_line_and_a_vessel_does_not(tiny_datase
     images[:, 30:, 10:20] //= 20
     images[:, 30:60, 40:50] //= 20
     beam = evidence(sweep, images).of(0)
-    assert beam.left[35:, 12:18].mean() < 0.2
-    assert beam.left[:25, 12:18].mean() > 0.9
-    assert beam.left[:, 40:50].mean() > 0.9
+    assert beam.share[35:, 12:18].mean() < 0.2
+    assert beam.share[:25, 12:18].mean() > 0.9
+    assert beam.share[:, 40:50].mean() > 0.9
     assert beam.echo[35:, 12:18].mean() == pytest.approx(90 / 255, rel=0.2), "as bright as tissue with the whole beam"
 
 

@@ -209,7 +209,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        given = {
+        by_output = {
             name: gradient.contiguous()
             for name, gradient in zip(ctx.names, gradients, strict=True)
             if gradient is not None
@@ -220,12 +220,12 @@ class _Render(torch.autograd.Function):
         with _on_device(views.device, f"the gradient of {len(views)} frames"):
             gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.kind)
             by_views = _room_for_views(slices) if ctx.needs_input_grad[4] else None
-            found, moments = differentiate(gaussians, views, ctx.geometry, slices, planes, given, by_views)
+            by_parameter, moments = differentiate(gaussians, views, ctx.geometry, slices, planes, by_output, by_views)
             by_beam = None if ctx.beam is None else Moments(*moments.tolist()).gradient(ctx.beam)
         by_poses = None
         if by_views is not None:
             by_poses = gradient_by_poses(ctx.poses.detach(), by_views.sum(dim=1).cpu())
-        return (None, None, None, None, by_poses, by_beam, *found.values())
+        return (None, None, None, None, by_poses, by_beam, *by_parameter.values())
 
 
 def _room_for_views(slices: Slices) -> Tensor:  # [C, B, 2, 3]

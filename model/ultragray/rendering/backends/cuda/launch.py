@@ -185,7 +185,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
     count, poses = len(gaussians.means), len(views)
     blocks = -(-count // how.block)
     places = poses * blocks * how.block
-    made = Slices(
+    slices = Slices(
         slices=torch.empty((places, constants.FIELDS.value), device=device),
         rectangles=torch.empty((places, constants.RECTANGLE.value), dtype=torch.int32, device=device),
         bounds=torch.empty((poses * blocks, 4), dtype=torch.int32, device=device),
@@ -197,7 +197,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
         slice_gaussians[(blocks, poses)](
             views,
             *gaussians.tensors,
-            *vars(made).values(),
+            *vars(slices).values(),
             count,
             gaussians.shn.stride(0),
             geometry.height,
@@ -212,7 +212,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
             BLOCK=how.block,
             num_warps=4,
         )
-    return made
+    return slices
 
 
 def empty_frames(outputs: Sequence[str], poses: int, geometry: Geometry, device: torch.device) -> dict[str, Tensor]:
@@ -293,23 +293,23 @@ def differentiate(
     poses, blocks = slices.counts.shape
     count, terms = len(gaussians.means), (gaussians.degree + 1) ** 2
     shapes_by_name = expected_shapes(count, gaussians.degree)  # in the order in which the kernel takes them
-    found = {name: torch.empty(shape, device=device) for name, shape in shapes_by_name.items()}
+    by_parameter = {name: torch.empty(shape, device=device) for name, shape in shapes_by_name.items()}
     by_beam = torch.zeros((blocks if geometry.thick else 0, 3), dtype=torch.float64, device=device)
     if not count:
-        return found, by_beam.sum(dim=0)
+        return by_parameter, by_beam.sum(dim=0)
     by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
     by_slice = torch.empty((poses * blocks * how.block, constants.GRADIENTS.value), device=device)
-    given = [gradients.get(name) for name in (*PLANES, *SUMS)]
+    by_output = [gradients.get(name) for name in (*PLANES, *SUMS)]
     if poses:
         differentiate_pixels[(-(-width // how.pixel_columns), poses)](
             planes.weight,
             planes.weighted,
             planes.transmittance,
-            *(planes.weight if gradient is None else gradient for gradient in given),
+            *(planes.weight if gradient is None else gradient for gradient in by_output),
             *by_pixel,
             height,
             width,
-            *(int(gradient is not None) for gradient in given),
+            *(int(gradient is not None) for gradient in by_output),
             ROWS=how.pixel_rows,
             COLUMNS=how.pixel_columns,
             num_warps=4,
@@ -341,7 +341,7 @@ def differentiate(
         slices.counts,
         slices.places,
         by_slice,
-        *found.values(),
+        *by_parameter.values(),
         views if by_views is None else by_views,
         by_beam,
         poses,
@@ -358,4 +358,4 @@ def differentiate(
         BLOCK=how.block,
         num_warps=4,
     )
-    return found, by_beam.sum(dim=0)
+    return by_parameter, by_beam.sum(dim=0)

@@ -208,21 +208,21 @@ def add_slices(
     counted = (u2 <= window2) | (fall <= -LOG2_E * MIN_PSI)
     w = tl.minimum(tl.exp2(u2 * -HALF_LOG2_E + echo_peak), MAX_WEIGHT)
     w = tl.where(counted, w, 0.0)
-    left = tl.where(counted, tl.maximum(tl.exp2(fall), 1.0 - MAX_WEIGHT), 1.0)  # 1 - alpha
+    transparency = tl.where(counted, tl.maximum(tl.exp2(fall), 1.0 - MAX_WEIGHT), 1.0)  # 1 - alpha
     absorb = tl.load(slices + slot * FIELDS + 9, hits, 0.0)
     ends = tl.load(rectangle + 3, hits, 0) <= y1
     return (
         total + tl.sum(w, 0),
         echo + tl.sum(field(slices, slot, hits, 8) * w, 0),
-        passing * product(passed(left, tl.where(ends, 0.0, absorb)), S_LANES),
-        ending * product(passed(left, tl.where(ends, absorb, 0.0)), S_LANES),
+        passing * product(passed(transparency, tl.where(ends, 0.0, absorb)), S_LANES),
+        ending * product(passed(transparency, tl.where(ends, absorb, 0.0)), S_LANES),
     )
 
 
 @triton.jit
-def passed(left, absorb):
+def passed(transparency, absorb):
     """1 - alpha (1 - tau), [S, rows, columns]; exactly 1 where nothing is absorbed."""
-    return (1.0 - absorb)[:, None, None] + absorb[:, None, None] * left
+    return (1.0 - absorb)[:, None, None] + absorb[:, None, None] * transparency
 
 
 @triton.jit

@@ -79,18 +79,18 @@ def differentiate_pixels(
         on_weighted_sum = tl.load(by_weighted_sum + pixel, inside & (has_weighted_sum != 0), 0.0)
 
         # E = ratio * share * sum(I w), ratio = (1 - exp(-S)) / S, share = S / (S + 1e-8).
-        left = tl.exp(-total)
+        decay = tl.exp(-total)
         small = total <= 0.03  # differences of nearly equal numbers there
         inverse, guarded = 1.0 / tl.maximum(total, 1e-30), 1.0 / (total + 1e-8)
         ratio = tl.where(
             small,
             1.0 - total * (0.5 - total * (0.16666666666666666 - total * 0.041666666666666664)),
-            (1.0 - left) * inverse,
+            (1.0 - decay) * inverse,
         )
         slope = tl.where(
             small,
             total * (0.3333333333333333 - total * (0.125 - total * 0.03333333333333333)) - 0.5,
-            (left - ratio) * inverse,
+            (decay - ratio) * inverse,
         )
         share = total * guarded
         factor = ratio * share
@@ -99,7 +99,7 @@ def differentiate_pixels(
         on_log = (on_passed + on_bmode * factor * sum_iw) * passed
         suffix = tl.cumsum(on_log, 0, reverse=True) + below[None, :]
         below += tl.sum(on_log, 0)
-        tl.store(by_weight + pixel, on_echo * sum_iw * factor_slope + on_coverage * left + on_sum, inside)
+        tl.store(by_weight + pixel, on_echo * sum_iw * factor_slope + on_coverage * decay + on_sum, inside)
         tl.store(by_weighted + pixel, on_echo * factor + on_weighted_sum, inside)
         tl.store(by_log + pixel, on_log, inside)
         tl.store(by_below + pixel, suffix, inside)

@@ -191,8 +191,8 @@ def slice_gaussians(
     index = block * BLOCK + lanes
     mask = index < count
     candidate = near_plane(view, means, scales, quats, index, mask)
-    found = tl.max(candidate.to(tl.int32), 0)
-    if found == 0:
+    has_candidate = tl.max(candidate.to(tl.int32), 0)
+    if has_candidate == 0:
         tl.store(counts + group, 0)
         tl.store(footprints + group, tl.full([], 0, tl.int64))
         for side in tl.static_range(4):
