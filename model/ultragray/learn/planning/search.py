@@ -382,7 +382,7 @@ def plan_views(
 ) -> ViewPlan:
     """The poses in reach whose frames would teach a scene most, in an order to travel them; mm, probe→scene.
 
-    `poses` [C, 4, 4] are all that is in reach, at most 4096 (None: what `asked` says of the skin); `view` [4, 4] is a
+    `poses` [C, 4, 4] are all that is in reach, at most 4096 (None: what `settings` say of the skin); `view` [4, 4] is a
     standard plane: only the points of its image count; `start` [4, 4] is where the probe is (None: the way begins
     anywhere). Raises InvalidArgument, InvalidPose, InvalidProbe; GivenUp by `limits`.
     """
@@ -391,23 +391,11 @@ def plan_views(
     probe, recorded = scene.info.probe_or(settings.probe), at_rest.training_poses
 
     standard, begin = _single(scene, view, "view"), _single(scene, start, "start")
-    plane = None
-    if standard is not None and settings.plane is not None:
-        raise InvalidArgument("view is a plane of its own: give view or plane, not both", field="plane")
-    if standard is not None:
-        plane = np.append(standard[:3, 1], standard[:3, 1] @ standard[:3, 3])
-    elif settings.plane is not None:
-        plane = np.array(settings.plane) / np.linalg.norm(settings.plane[:3])
-        plane[3] = settings.plane[3]
+    plane = _plane(settings, standard)
     if poses is None:
         candidates = poses_in_reach(recorded, scene.info.probe, probe, settings, plane)
     else:
-        candidates = scene.poses_at_rest(check_poses(poses))
-        if not 1 <= len(candidates) <= MAX_LISTED:
-            raise InvalidArgument(f"poses must be 1 to {MAX_LISTED}, got {len(candidates)}", field="poses")
-        candidates = candidates[within_box(candidates, probe, settings)]
-        if not len(candidates):
-            raise InvalidArgument("none of the poses has the middle of the probe's face within box_mm", field="box_mm")
+        candidates = _listed(scene, poses, probe, settings)
     targets = Targets.of(at_rest, settings, standard, plane, candidates, probe)
     limits.check_flag()
     model, hardness = read_model(scene.info.confidence, len(recorded)), np.zeros(len(targets.points), np.float32)
@@ -427,8 +415,6 @@ def plan_views(
     before, worths = float(best.mean(dtype=np.float64)), worth_of(candidates, probe)
     corners = probe.corners_from(candidates)
     from_start = None if begin is None else corner_distances_mm(corners, probe.corners_from(begin[None]))
-    way = None if settings.path_mm is None else Way(corners, from_start, settings.path_mm)
-
     is_shaded = np.zeros(len(candidates), bool)
 
     def shade_once(view: int) -> None:
@@ -437,22 +423,16 @@ def plan_views(
             shade(worths[view], best, targets.points, candidates[view], probe, attenuation)
         is_shaded[view] = True
 
-    if way is not None:
-
-        def go_on(view: int) -> None:
-            limits.check_flag()
-            way.add(view)
-
-        chosen, gains = choose(worths, best.copy(), settings.views, shade=shade_once, costs=way.costs, after_each=go_on)
-        order, path_mm = np.array([chosen.index(view) for view in way.views], np.int64), way.length_mm
-    else:
-        chosen, _ = choose(worths, best.copy(), settings.views, shade=shade_once)
-        chosen = exchange(worths, best, chosen, shade=shade_once)
-        ranks, gains = choose(worths[chosen], best, len(chosen))
-        chosen = [chosen[rank] for rank in ranks]
-        some = corners[chosen]
-        steps_mm = corner_distances_mm(some[:, None], some[None])
+    if settings.path_mm is None:
+        chosen, gains = _exchanged(worths, best, settings.views, shade_once)
+        steps_mm = corner_distances_mm(corners[chosen][:, None], corners[chosen][None])
         order, path_mm = shortest_path(steps_mm, None if from_start is None else from_start[chosen])
+    else:
+        way = Way(corners, from_start, settings.path_mm)
+        chosen, gains = choose(
+            worths, best.copy(), settings.views, shade=shade_once, costs=way.costs, after_each=way.add
+        )
+        order, path_mm = np.array([chosen.index(view) for view in way.views], np.int64), way.length_mm
     scale, least = 1.0, 0.0
     if settings.want == "confidence" and model is not None:
         scale, least = 1.0 - model.black_ms_ssim, model.black_ms_ssim
@@ -464,6 +444,45 @@ def plan_views(
         after=least + scale * (before + sum(gains)),
         path_mm=path_mm,
     )
+
+
+def _plane(settings: PlanSettings, standard: FloatArray | None) -> FloatArray | None:  # [4, 4] -> [4]
+    """The normal and distance of the plane whose points count: that of the standard view, or the one in the settings.
+
+    Raises InvalidArgument where both are given.
+    """
+    if standard is not None:
+        if settings.plane is not None:
+            raise InvalidArgument("view is a plane of its own: give view or plane, not both", field="plane")
+        return np.append(standard[:3, 1], standard[:3, 1] @ standard[:3, 3])
+    if settings.plane is None:
+        return None
+    normal = np.array(settings.plane[:3])
+    return np.append(normal / np.linalg.norm(normal), settings.plane[3])
+
+
+def _listed(scene: GaussianScene, poses: Any, probe: Probe, settings: PlanSettings) -> FloatArray:  # -> [C, 4, 4] mm
+    """Poses that a caller lists as all in reach, in the tissue at rest, less those outside of box_mm.
+
+    Raises InvalidArgument where there are too many or none is left, and InvalidPose.
+    """
+    listed = scene.poses_at_rest(check_poses(poses))
+    if not 1 <= len(listed) <= MAX_LISTED:
+        raise InvalidArgument(f"poses must be 1 to {MAX_LISTED}, got {len(listed)}", field="poses")
+    candidates = listed[within_box(listed, probe, settings)]
+    if not len(candidates):
+        raise InvalidArgument("none of the poses has the middle of the probe's face within box_mm", field="box_mm")
+    return candidates
+
+
+def _exchanged(
+    worths: Values, best: Values, views: int, shade: Callable[[int], None]
+) -> tuple[list[int], list[float]]:  # [C, V], [V]
+    """The views of the largest gains, exchanged, in the order of what each gains beside those before it."""
+    chosen, _ = choose(worths, best.copy(), views, shade=shade)
+    chosen = exchange(worths, best, chosen, shade=shade)
+    ranks, gains = choose(worths[chosen], best, len(chosen))
+    return [chosen[rank] for rank in ranks], gains
 
 
 def _single(scene: GaussianScene, pose: Any, field: str) -> FloatArray | None:  # -> [4, 4] mm, at rest
