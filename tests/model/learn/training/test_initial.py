@@ -361,7 +361,7 @@ def test_half_of_the_beam_is_told(tiny_dataset):
     sweep = tiny_dataset().train
     images = speckled(sweep)
     images[:, 30:, 10:20] //= 2
-    left = evidence(sweep, images).of(0).left
+    left = evidence(sweep, images).of(0).share
     assert left[35:85, 12:18].mean() == pytest.approx(0.5, abs=0.12)
 
 
@@ -373,7 +373,7 @@ def test_a_depth_that_is_dark_everywhere_is_no_evidence(tiny_dataset):
     assert not evidence(sweep, dots).of(0).is_shadowed.any()
     fading = speckled(sweep)
     fading[:, 60:] = 2
-    assert evidence(sweep, fading).of(0).left[:, 5:-5].mean() > 0.95
+    assert evidence(sweep, fading).of(0).share[:, 5:-5].mean() > 0.95
 
 
 @pytest.mark.parametrize("level", [0, 1])
