@@ -231,7 +231,7 @@ describe("connect", () => {
 
   it("tells version, renderer and documentation, and latency on the image only when asked", async () => {
     const { page } = await openScan(at);
-    assert.match(await page.getByTestId("service-version").textContent(), /^\d+\.\d+/);
+    await until(() => page.getByTestId("service-version").textContent(), (text) => /^\d+\.\d+/.test(text), "no version");
     await until(() => page.getByTestId("service-renderer").textContent(), (text) => /^ultragray\/.* cpu/.test(text), "no renderer");
     assert.equal(await page.getByRole("link", { name: "API documentation" }).getAttribute("href"), "/docs");
     assert.equal(await page.getByTestId("latency").count(), 0);
