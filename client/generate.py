@@ -130,12 +130,12 @@ def generate_errors(output_folder: Path) -> Path:
     """Writes errors.py and returns its path."""
     classes = dict(_error_classes())
     tree = _below("ClientError", {name: bases[0] for name, (bases, _) in classes.items()})
-    drawn = "\n".join(["ClientError", *(line for line, _ in tree)])
+    lines = "\n".join(["ClientError", *(line for line, _ in tree)])
     sources = [
         f"class {name}({', '.join(classes[name][0])}):\n    {_quoted(_wrapped(classes[name][1]))}\n" for _, name in tree
     ]
     target = output_folder / "errors.py"
-    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, "ERRORS = ClientError.branch()\n"]))
+    target.write_text(_ERRORS_HEADER.format(tree=lines) + "\n".join([*sources, "ERRORS = ClientError.branch()\n"]))
     return formatted([target])[0]
 
 
@@ -144,17 +144,17 @@ def _error_classes() -> Iterator[tuple[str, tuple[list[str], str]]]:
     meanings = {
         cls.reason: " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split()) for cls in error_classes()
     }
-    found = {}
+    classes = {}
     for reason, statuses in STATUSES.items():
         status = statuses.grpc
         if reason not in {*NOT_OVER_GRPC, "INTERNAL"}:
             base = "ClientError" if status == "INTERNAL" else _camel(status)
             root = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
-            found.setdefault(base, ("ClientError", root))
-            found.setdefault(_camel(reason), (base, meanings[reason]))
-    found.pop("ClientError", None)
-    found |= {_camel(reason): base_and_meaning for reason, base_and_meaning in OWN_ERRORS.items()}
-    return ((name, ([base, *_ALSO.get(name, ())], meaning)) for name, (base, meaning) in found.items())
+            classes.setdefault(base, ("ClientError", root))
+            classes.setdefault(_camel(reason), (base, meanings[reason]))
+    classes.pop("ClientError", None)
+    classes |= {_camel(reason): base_and_meaning for reason, base_and_meaning in OWN_ERRORS.items()}
+    return ((name, ([base, *_ALSO.get(name, ())], meaning)) for name, (base, meaning) in classes.items())
 
 
 def _camel(reason: str) -> str:
@@ -164,11 +164,11 @@ def _camel(reason: str) -> str:
 def _below(base: str, bases: dict[str, str], indent: str = "") -> list[tuple[str, str]]:
     """The classes below a base, in their order, each with its line of the drawn tree."""
     below = [name for name, own in bases.items() if own == base]
-    found = []
+    lines = []
     for name in below:
         branch, further = ("└── ", "    ") if name == below[-1] else ("├── ", "│   ")
-        found += [(f"{indent}{branch}{name}", name), *_below(name, bases, indent + further)]
-    return found
+        lines += [(f"{indent}{branch}{name}", name), *_below(name, bases, indent + further)]
+    return lines
 
 
 def generate_contract(output_folder: Path) -> Path:
@@ -231,8 +231,8 @@ def _enum_source(cls: type[Enum]) -> str:
 def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
     families = [base for base in cls.__bases__ if Family in base.__bases__]  # their members have their fields
     names = {name for one in (cls, *families) for name in inspect.get_annotations(one)} - LEFT_OUT
-    given = [item for item, _ in annotated_fields(cls) if item.name in names and item.metadata]  # not a base's `kind`
-    own = sorted(given, key=lambda item: item.kw_only)
+    items = [item for item, _ in annotated_fields(cls) if item.name in names and item.metadata]  # not a base's `kind`
+    own = sorted(items, key=lambda item: item.kw_only)
     is_kw_only = all(item.kw_only for item in own)
     options = "frozen=True, kw_only=True" if is_kw_only else "frozen=True"
     head = f"class {name}" + (f"({', '.join(base.__name__ for base in bases)})" if bases else "")
@@ -243,14 +243,14 @@ def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
 def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     if str(item.type).startswith("Literal"):  # what tells a member of a family apart
         return f"    kind: Literal[{item.default!r}] = field_of(default={item.default!r}, repr=False, kw_only=True)"
-    given = ""
+    arguments = ""
     if item.default is not MISSING:
-        given = f"default={_default_source(item.default)}"
+        arguments = f"default={_default_source(item.default)}"
     elif item.default_factory is not MISSING:
-        given = f"default_factory={item.default_factory.__name__}"
-    default = f" = field_of({given}{', kw_only=True' if kw_only else ''})" if given else ""
-    if given.startswith("default=") and not kw_only:
-        default = f" = {given.removeprefix('default=')}"
+        arguments = f"default_factory={item.default_factory.__name__}"
+    default = f" = field_of({arguments}{', kw_only=True' if kw_only else ''})" if arguments else ""
+    if arguments.startswith("default=") and not kw_only:
+        default = f" = {arguments.removeprefix('default=')}"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
     source, words = f"    {item.name}: {annotation}{default}", item.metadata["description"]
     if len(line := f"{source}  # {words}") <= 120:

@@ -131,7 +131,7 @@ class Scenes(Group[AnyConnection]):
             "SceneService.LabelScene",
             scene_from_message,
             timeout_s,
-            asked={"probe": probe},
+            request={"probe": probe},
             scene=name,
             into=into,
             frames=[scenes_pb2.PaintedFrame(pose=pose_message(pose), labels=labels) for pose, labels in frames],
@@ -151,8 +151,8 @@ class Scenes(Group[AnyConnection]):
 
         Raises SceneNotFound, SceneExists, and InvalidArgument with the path of what is wrong.
         """
-        asked = {"into": into, "edits": list(edits), "private": private}
-        return Call("SceneService.EditScene", scene_from_message, timeout_s, asked=asked, scene=name)
+        request = {"into": into, "edits": list(edits), "private": private}
+        return Call("SceneService.EditScene", scene_from_message, timeout_s, request=request, scene=name)
 
     @operation
     def from_labels(
@@ -162,7 +162,7 @@ class Scenes(Group[AnyConnection]):
 
         Raises SceneExists, and InvalidArgument with the path of what is wrong.
         """
-        return Call("SceneService.MakeScene", scene_from_message, timeout_s, asked=recipe, into=into, private=private)
+        return Call("SceneService.MakeScene", scene_from_message, timeout_s, request=recipe, into=into, private=private)
 
 
 class Datasets(Group[AnyConnection]):
@@ -223,8 +223,8 @@ class Recordings(Group[AnyConnection]):
         """Begins a recording under the name of the dataset that it becomes; of one that was begun with these settings,
         how far it is. Others do not see a `private` one. Raises DatasetExists, LimitReached.
         """
-        asked = {"dataset": name, "settings": settings, "private": private}
-        return Call("RecordingService.BeginRecording", RecordingView, timeout_s, asked=asked)
+        request = {"dataset": name, "settings": settings, "private": private}
+        return Call("RecordingService.BeginRecording", RecordingView, timeout_s, request=request)
 
     @operation
     def get(self, name: str, *, timeout_s: float | None = None) -> Call[RecordingView]:
@@ -305,8 +305,8 @@ class Jobs(Group[AnyConnection]):
         timeout_s: float | None = None,
     ) -> Listing[Job]:
         """The newest jobs first, at most `limit`; None: all that the service keeps."""
-        asked = {"state": state, "kind": kind}
-        return Listing("JobService.ListJobs", "jobs", job_from_message, timeout_s, limit, asked)
+        request = {"state": state, "kind": kind}
+        return Listing("JobService.ListJobs", "jobs", job_from_message, timeout_s, limit, request)
 
     @operation
     def get(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
@@ -458,8 +458,8 @@ class _Client(Group[AnyConnection]):
 
         Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
         """
-        asked = {"settings": settings_message(scene, settings), "pose": pose_message(pose)}
-        return Call("RenderService.Render", frame_from_message, timeout_s, **asked)
+        request = {"settings": settings_message(scene, settings), "pose": pose_message(pose)}
+        return Call("RenderService.Render", frame_from_message, timeout_s, **request)
 
     @operation
     def render_batch(
@@ -524,8 +524,8 @@ class _Client(Group[AnyConnection]):
 
         Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
         """
-        asked = {"scene": scene, "slice": plane}
-        return Call("RenderService.RenderSlice", slice_from_message, timeout_s, asked=asked)
+        request = {"scene": scene, "slice": plane}
+        return Call("RenderService.RenderSlice", slice_from_message, timeout_s, request=request)
 
     @operation
     def assess_poses(
@@ -548,7 +548,7 @@ class _Client(Group[AnyConnection]):
             "RenderService.AssessPoses",
             each("extrapolations", Extrapolation),
             timeout_s,
-            asked={"probe": probe},
+            request={"probe": probe},
             scene=scene,
             poses=pose_messages(poses),
             registration=registration,
@@ -580,7 +580,7 @@ class _Client(Group[AnyConnection]):
             "RenderService.Localize",
             Localization,
             timeout_s,
-            asked={"probe": probe, "search": search},
+            request={"probe": probe, "search": search},
             scene=scene,
             start=None if start is None else pose_message(start, field="start"),
             registration=registration,
@@ -612,7 +612,7 @@ class _Client(Group[AnyConnection]):
             "RenderService.PlanViews",
             ViewPlan,
             timeout_s,
-            asked=settings or PlanSettings(),
+            request=settings or PlanSettings(),
             scene=scene,
             poses=pose_messages(poses),
             view=None if view is None else pose_message(view, field="view"),
@@ -639,8 +639,8 @@ class _Client(Group[AnyConnection]):
 
         For admins alone. Raises PermissionDenied, InvalidArgument.
         """
-        asked = {"since_hours": since_hours, "who": who, "what": what, "limit": limit}
-        return Call("AccessService.ListAuditEntries", each("entries", AuditEntry), timeout_s, **asked)
+        request = {"since_hours": since_hours, "who": who, "what": what, "limit": limit}
+        return Call("AccessService.ListAuditEntries", each("entries", AuditEntry), timeout_s, **request)
 
 
 class Client(_Client[Connection]):

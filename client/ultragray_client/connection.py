@@ -311,8 +311,8 @@ def target_of(address: str, tls: Tls | None) -> tuple[str, Tls | None]:
 
     Raises InvalidArgument for an http URL with `tls`, for one with a path, and for an empty address.
     """
-    found = _URL.fullmatch(address)
-    scheme, host, path = ("", address, "") if found is None else found.groups()
+    match = _URL.fullmatch(address)
+    scheme, host, path = ("", address, "") if match is None else match.groups()
     if not host or path.strip("/") or (scheme == "http" and tls is not None):
         raise InvalidArgument(
             f"address must be HOST:PORT of the service's gRPC, http:// before it without TLS or https:// with it, "
@@ -336,8 +336,8 @@ def is_local(address: str) -> bool:
     """Whether an address is one of this host alone."""
     if address.startswith(_LOCAL_SCHEMES):
         return True
-    found = _TARGET.match(address)
-    host = "" if found is None else found[1].strip("[]")
+    match = _TARGET.match(address)
+    host = "" if match is None else match[1].strip("[]")
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

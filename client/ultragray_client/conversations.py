@@ -81,20 +81,20 @@ class Batch(Conversation[Frame]):
 
     def pause_s(self, error: ClientError, retries: Retries) -> float:
         """The seconds to wait; asks for fewer poses at once where they were too many."""
-        asked = min(self._per_call, len(self._waiting))
-        if isinstance(error, TooManyPoses) and asked > 1:
-            self._per_call = asked // 2
+        count = min(self._per_call, len(self._waiting))
+        if isinstance(error, TooManyPoses) and count > 1:
+            self._per_call = count // 2
             return 0.0
         return retries.pause_s(self._renumbered(error))
 
     def _renumbered(self, error: ClientError) -> ClientError:
         """The error with the index in the whole batch, where it names a pose of one call."""
-        named = re.match(r"pose$|poses\[(\d+)\]", error.field or "")
-        if named is None:
+        match = re.match(r"pose$|poses\[(\d+)\]", error.field or "")
+        if match is None:
             return error
         # One that is found while frames come, in their order, is told as that of a single pose.
-        index = self._first if named[1] is None else self._first_of_call + int(named[1])
-        detail, field = (text.replace(named[0], f"poses[{index}]", 1) for text in (error.detail, error.field or ""))
+        index = self._first if match[1] is None else self._first_of_call + int(match[1])
+        detail, field = (text.replace(match[0], f"poses[{index}]", 1) for text in (error.detail, error.field or ""))
         return type(error)(detail, reason=error.reason, field=field, retry_after_s=error.retry_after_s)
 
 
@@ -158,19 +158,19 @@ class Recorder(Conversation[RecordingAnswer]):
         return super().pause_s(error, retries)
 
     def _messages(self, call: int) -> Iterator[recordings_pb2.RecordFramesRequest]:
-        request, sent = recordings_pb2.RecordFramesRequest, -1
+        request, last_number = recordings_pb2.RecordFramesRequest, -1
         yield request(dataset=self._name)
         self._is_answered.wait()
         while call == self._call:
             with self._taking:
                 with self._changing:
-                    waiting = [frame for frame in self._unstored if frame.number > sent]
+                    waiting = [frame for frame in self._unstored if frame.number > last_number]
                 if not waiting and (frame := self._next()) is not None:
                     waiting = [frame]
             if not waiting:
                 return
             for one in waiting:
-                sent = one.number
+                last_number = one.number
                 yield request(frame=one)
 
     def _next(self) -> recordings_pb2.IncomingFrame | None:

@@ -363,7 +363,7 @@ class Unanswered:
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
-    def sent(self, message: rendering_pb2.RenderStreamRequest) -> None:
+    def add(self, message: rendering_pb2.RenderStreamRequest) -> None:
         """A pose goes out."""
         if self._newest_alone:
             self._waiting.clear()
@@ -389,7 +389,7 @@ class Unanswered:
 
     def again(self) -> list[rendering_pb2.RenderStreamRequest]:
         """The poses to send over another connection, in their order, each with what is left of its time."""
-        return [_with_time_left(message, sent) for message, sent in self._waiting.values()]
+        return [_with_time_left(message, sent_s) for message, sent_s in self._waiting.values()]
 
     def take_lost(self) -> int:
         """The number of poses since the last call that the caller hears nothing of, and that are not sent again."""
@@ -398,10 +398,10 @@ class Unanswered:
         return lost
 
 
-def _with_time_left(message: rendering_pb2.RenderStreamRequest, sent: float) -> rendering_pb2.RenderStreamRequest:
+def _with_time_left(message: rendering_pb2.RenderStreamRequest, sent_s: float) -> rendering_pb2.RenderStreamRequest:
     if not message.HasField("timeout_ms"):
         return message
     again = rendering_pb2.RenderStreamRequest()
     again.CopyFrom(message)
-    again.timeout_ms = max(message.timeout_ms - 1000.0 * (time.monotonic() - sent), _LEAST_TIMEOUT_MS)
+    again.timeout_ms = max(message.timeout_ms - 1000.0 * (time.monotonic() - sent_s), _LEAST_TIMEOUT_MS)
     return again

@@ -90,21 +90,21 @@ class Frame(FrameOrigin):
 
 def origin_of(frame: Frame) -> dict[str, Any]:
     """The origin of a frame and its settings as used, as JSON holds them; as the files of jobs have it."""
-    found: dict[str, Any] = {name: getattr(frame, name) for name in ("scene", "scene_sha256", "renderer")}
+    origin: dict[str, Any] = {name: getattr(frame, name) for name in ("scene", "scene_sha256", "renderer")}
     plain = {one.name: one.default for one in fields(Additions)}  # as they are where they were not asked for
     for one in fields(SettingsUsed):
         value = getattr(frame, one.name)
         if one.name not in plain or value != plain[one.name]:
-            found[one.name] = _plain(value)
+            origin[one.name] = _plain(value)
     picture = frame.picture
-    found["picture"] = {
+    origin["picture"] = {
         "height": frame.height,
         "width": frame.width,
         "column_unit": picture.column_unit,
         "first": (picture.first_column, picture.first_row_mm),
         "step": (picture.column_step, picture.row_step_mm),
     }
-    return found
+    return origin
 
 
 def _plain(value: Any) -> Any:

@@ -54,8 +54,8 @@ def matrix_message(pose: npt.ArrayLike, *, field: str, otherwise: str = "") -> g
     try:
         matrix = np.asarray(pose, np.float64)
     except (TypeError, ValueError):
-        got = type(pose).__name__
-        raise InvalidPose(f"{field} must be {otherwise}numbers [4, 4], got {got}", field=field) from None
+        kind = type(pose).__name__
+        raise InvalidPose(f"{field} must be {otherwise}numbers [4, 4], got {kind}", field=field) from None
     if matrix.shape != (4, 4):
         raise InvalidPose(f"{field} must be {otherwise}[4, 4], got {list(matrix.shape)}", field=field)
     return geometry_pb2.Matrix(values=matrix.ravel().tolist())

@@ -36,18 +36,18 @@ class HoldStill:
         if isinstance(frame, ClientError):
             return f"no frame: {frame.reason}"
         age_ms = None if frame.latency_ms is None else frame.latency_ms + waited_ms
-        found, told = frame.extrapolation, "is not told"
+        extrapolation, unknown = frame.extrapolation, "is not told"
         if self.most_age_ms is not None and not (age_ms is not None and age_ms <= self.most_age_ms):
-            return f"age {told if age_ms is None else f'of {age_ms:.0f} ms'}"
+            return f"age {unknown if age_ms is None else f'of {age_ms:.0f} ms'}"
         if self.most_error_mm is not None:
             error_mm = None if frame.prediction is None else frame.prediction.error_mm
             if not (error_mm is not None and error_mm <= self.most_error_mm):
-                return f"error of the pose {told if error_mm is None else f'of {error_mm:.2f} mm'}"
+                return f"error of the pose {unknown if error_mm is None else f'of {error_mm:.2f} mm'}"
         for name, value, least in (
-            ("confidence", found.confidence, self.least_confidence),
+            ("confidence", extrapolation.confidence, self.least_confidence),
             ("trust", None if frame.preview is None else frame.preview.trust, self.least_trust),
-            ("contact", found.contact_share, self.least_contact),
+            ("contact", extrapolation.contact_share, self.least_contact),
         ):
             if least is not None and not (value is not None and value >= least):
-                return f"{name} {told if value is None else f'of {value:.2f}'}"
+                return f"{name} {unknown if value is None else f'of {value:.2f}'}"
         return None

@@ -54,15 +54,15 @@ class LocalCall:
 
     def _read(self, end: socket.socket) -> bytes | None:
         """The bytes of the next message; None after the last one."""
-        held = self._received
+        buffer = self._received
         while True:
-            if len(held) >= _LENGTH.size and len(held) >= (stop := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
-                data = bytes(memoryview(held)[_LENGTH.size : stop])
-                del held[:stop]
+            if len(buffer) >= _LENGTH.size and len(buffer) >= (stop := _LENGTH.size + _LENGTH.unpack_from(buffer)[0]):
+                data = bytes(memoryview(buffer)[_LENGTH.size : stop])
+                del buffer[:stop]
                 return data
             if not (some := end.recv(_READ_BYTES)):
                 return None
-            held += some
+            buffer += some
 
     def send_at_once(self, message: Any) -> bool:
         """Sends a message from the thread of the caller; False where the socket is not open or would have it wait."""
@@ -71,8 +71,8 @@ class LocalCall:
         data = message.SerializeToString()
         data = _LENGTH.pack(len(data)) + data
         try:
-            sent = self._socket.send(data, socket.MSG_DONTWAIT)
-            self._socket.sendall(data[sent:])
+            count = self._socket.send(data, socket.MSG_DONTWAIT)
+            self._socket.sendall(data[count:])
         except OSError:  # no room, or the call is over: reading tells why
             return False
         return True

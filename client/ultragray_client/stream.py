@@ -136,7 +136,7 @@ class FrameStream(_PoseStream):
                 self._unsent.pop()
                 self._unanswered.replaced()
                 self._lost += 1
-            self._unanswered.sent(message)
+            self._unanswered.add(message)
             if not self._is_sent_at_once(message):
                 self._unsent.append(message)
                 self._changed.notify_all()
@@ -419,7 +419,7 @@ class AsyncFrameStream(_PoseStream):
             if self._closed:
                 raise StreamEnded(TAKES_NO_MORE)
             self._begin()
-            self._unanswered.sent(message)
+            self._unanswered.add(message)
             self._unsent.append(message)
             call = self._call
             if await self._send_waiting():

@@ -59,13 +59,13 @@ class Connection(Terms):
     def method(self, name: str) -> Any:
         """A method over the channel, such as "SceneService.GetScene"."""
         if name not in self._methods:
-            found = _described(name)
-            words = ("stream" if streams else "unary" for streams in (found.client_streaming, found.server_streaming))
+            method = _described(name)
+            words = ("stream" if streams else "unary" for streams in (method.client_streaming, method.server_streaming))
             self._methods[name] = getattr(self._channel, "_".join(words))(
-                f"/{found.containing_service.full_name}/{found.name}",
-                request_serializer=GetMessageClass(found.input_type).SerializeToString,
-                response_deserializer=_READERS.get(found.output_type.name)
-                or GetMessageClass(found.output_type).FromString,
+                f"/{method.containing_service.full_name}/{method.name}",
+                request_serializer=GetMessageClass(method.input_type).SerializeToString,
+                response_deserializer=_READERS.get(method.output_type.name)
+                or GetMessageClass(method.output_type).FromString,
             )
         return self._methods[name]
 
@@ -168,7 +168,7 @@ async def _read_in_threads(messages: Iterator[T]) -> AsyncIterator[T]:
 class Call(Generic[T]):
     """A question with one answer. `timeout_s` is for all attempts together; None: the client's.
 
-    The request has `fields`, and those of `asked`, in the form that a caller gives them; `read` makes the answer of
+    The request has `fields`, and those of `request`, in the form that a caller gives them; `read` makes the answer of
     the message, or is the dataclass that it tells.
     """
 
@@ -178,12 +178,12 @@ class Call(Generic[T]):
         read: Callable[[Any], T] | type[T],
         timeout_s: float | None,
         *,
-        asked: object = MappingProxyType({}),
+        request: object = MappingProxyType({}),
         **fields: Any,
     ) -> None:
         """Raises InvalidArgument for a word that no message has."""
         self._method, self._timeout_s = method, timeout_s
-        self._request = message_of(asked, GetMessageClass(_described(method).input_type), **fields)
+        self._request = message_of(request, GetMessageClass(_described(method).input_type), **fields)
         self._read = _reading(read)
 
     async def answer(self, connection: Connection) -> T:
@@ -248,21 +248,21 @@ class Listing(Call[tuple[T, ...]]):
         read: Callable[[Any], T] | type[T],
         timeout_s: float | None,
         limit: int | None = None,
-        asked: object = MappingProxyType({}),
+        request: object = MappingProxyType({}),
     ) -> None:
-        super().__init__(method, each(items, read), timeout_s, asked=asked)
+        super().__init__(method, each(items, read), timeout_s, request=request)
         self._limit = limit
 
     async def answer(self, connection: Connection) -> tuple[T, ...]:
-        found: tuple[T, ...] = ()
-        while self._limit is None or len(found) < self._limit:
-            self._request.page_size = PAGE_SIZE if self._limit is None else min(PAGE_SIZE, self._limit - len(found))
+        items: tuple[T, ...] = ()
+        while self._limit is None or len(items) < self._limit:
+            self._request.page_size = PAGE_SIZE if self._limit is None else min(PAGE_SIZE, self._limit - len(items))
             page = await self._ask(connection, connection.retries(self._timeout_s, is_short=True))
-            found += self._read(page)
+            items += self._read(page)
             self._request.page_token = page.next_page_token
             if not page.next_page_token:
                 break
-        return found
+        return items
 
 
 def each(items: str, read: Callable[[Any], T] | type[T]) -> Callable[[Any], tuple[T, ...]]:

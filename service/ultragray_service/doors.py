@@ -53,9 +53,9 @@ class Doors:
         )
 
     def fields(self) -> dict[str, str]:
-        found = {"http": self.http, "grpc": self.grpc, "docs": f"{self.http}/docs"}
-        found["data_folder"] = str(self.settings.data_folder)
-        return found if self.igtl is None else {**found, "igtl": self.igtl}
+        values = {"http": self.http, "grpc": self.grpc, "docs": f"{self.http}/docs"}
+        values["data_folder"] = str(self.settings.data_folder)
+        return values if self.igtl is None else {**values, "igtl": self.igtl}
 
     def in_words(self) -> str:
         tls = " with TLS" if self.settings.tls_certificate is not None else ""

@@ -174,26 +174,26 @@ class OpenSockets:
         return refused
 
     def _let_in(self, file: int, inode: int) -> bool:
-        with socket.socket(fileno=os.dup(file)) as found:
-            if os.fstat(found.fileno()).st_ino != inode:
+        with socket.socket(fileno=os.dup(file)) as connection:
+            if os.fstat(connection.fileno()).st_ino != inode:
                 return True  # another has its number by now, and is seen the next time
-            peer = self._peer(found)
+            peer = self._peer(connection)
             if peer is None:
                 self._others.add(inode)
                 return True
             try:
                 self._places[inode] = self._connections.enter(peer)
             except TooManyConnections:
-                found.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
                 return False
         return True
 
-    def _peer(self, found: socket.socket) -> str | None:
+    def _peer(self, connection: socket.socket) -> str | None:
         """The host of the other end of a connection to the port; None for another socket."""
-        if found.family not in (socket.AF_INET, socket.AF_INET6) or found.getsockname()[1] != self._port:
+        if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.getsockname()[1] != self._port:
             return None
         try:
-            return str(found.getpeername()[0])
+            return str(connection.getpeername()[0])
         except OSError:  # the one that listens
             return None
 

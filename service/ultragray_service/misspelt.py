@@ -11,12 +11,12 @@ from ultragray_service.environment import COMMAND_VARIABLES, OTHER_VARIABLES, PR
 
 def unknown_variables() -> Iterator[str]:
     """A sentence for each variable that begins like ours and is none, with the one that was perhaps meant."""
-    given = {name for name in os.environ if name.startswith(PREFIX)} - set(COMMAND_VARIABLES)
-    if not given:
+    names = {name for name in os.environ if name.startswith(PREFIX)} - set(COMMAND_VARIABLES)
+    if not names:
         return  # the usual case; to know the settings takes a while
     known = known_variables()
     words = [one.removeprefix(PREFIX) for one in known]  # what they share makes none of them more alike
-    for name in sorted(given - set(known)):
+    for name in sorted(names - set(known)):
         near = get_close_matches(name.removeprefix(PREFIX), words, n=1, cutoff=0.8)
         perhaps = f"; did you mean {PREFIX}{near[0]}?" if near else ""
         yield f"the environment variable {name} is not known and is ignored{perhaps}"

@@ -110,12 +110,12 @@ class EmbeddedWorker:
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         values = {name: getattr(self._settings, name) for name in _PASSED_ON}
-        given = {ENVIRONMENT_PREFIX + name.upper(): str(value) for name, value in values.items() if value is not None}
+        exports = {ENVIRONMENT_PREFIX + name.upper(): str(value) for name, value in values.items() if value is not None}
         # Not asyncio's: it forks, which gRPC complains about.
         return subprocess.Popen(
             [sys.executable, "-m", "ultragray_service.cli.worker", str(os.getpid())],
             stdin=subprocess.DEVNULL,
-            env={**os.environ, **given, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            env={**os.environ, **exports, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
             start_new_session=True,  # Ctrl-C is for the service, which then stops the worker
         )
 

@@ -295,8 +295,8 @@ class Settings(Contract):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("data_folder", "artifact_folder"):
-            if (given := getattr(self, name)) is not None:
-                object.__setattr__(self, name, parse_location(given, name))
+            if (location := getattr(self, name)) is not None:
+                object.__setattr__(self, name, parse_location(location, name))
         if isinstance(self.artifacts, StorageUrl) and self.database_url is None:
             raise InvalidArgument(
                 "database_url must name a PostgreSQL database where datasets and jobs are in a bucket "
@@ -368,5 +368,5 @@ def load_settings(**overrides: Any) -> Settings:
         return Settings(**values)
     except InvalidArgument as error:
         name = str(error.field).partition("[")[0]
-        named = f"{name} (environment variable {ENVIRONMENT_PREFIX}{name.upper()})"
-        raise InvalidArgument(error.detail.replace(name, named, 1), field=name) from None
+        full_name = f"{name} (environment variable {ENVIRONMENT_PREFIX}{name.upper()})"
+        raise InvalidArgument(error.detail.replace(name, full_name, 1), field=name) from None

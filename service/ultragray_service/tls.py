@@ -39,18 +39,18 @@ class CertificateFiles:
             None if self.client_ca is None else _read(self.client_ca, "tls_client_ca"),
         )
 
-    def load(self, read: CertificateBytes) -> Certificates:
+    def load(self, data: CertificateBytes) -> Certificates:
         try:
-            return self._load(read)
+            return self._load(data)
         except (UnsupportedAlgorithm, x509.DuplicateExtension, ValueError) as error:
             raise _unusable("tls_certificate", f"{self.certificate} and {self.key}: {error}") from None
         except OSError as error:  # a file that went after it was read
             raise _unusable("tls_certificate", f"{self.certificate} and {self.key}: {error.strerror}") from None
 
-    def _load(self, read: CertificateBytes) -> Certificates:
-        chain = self._chain(read.chain)
+    def _load(self, data: CertificateBytes) -> Certificates:
+        chain = self._chain(data.chain)
         own = chain[0]
-        if self._private_key(read.key).public_key().public_bytes(
+        if self._private_key(data.key).public_key().public_bytes(
             Encoding.DER, PublicFormat.SubjectPublicKeyInfo
         ) != own.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo):
             raise _unusable("tls_key", f"{self.key} is not the key of the certificate in {self.certificate}")
@@ -59,7 +59,7 @@ class CertificateFiles:
             raise _unusable("tls_certificate", f"{self.certificate} is not valid before {own.not_valid_before_utc}")
         if now > own.not_valid_after_utc:
             raise _unusable("tls_certificate", f"{self.certificate} expired at {own.not_valid_after_utc}")
-        return Certificates(read, _names(own), own.not_valid_before_utc, own.not_valid_after_utc, self._context(read))
+        return Certificates(data, _names(own), own.not_valid_before_utc, own.not_valid_after_utc, self._context(data))
 
     def _chain(self, content: bytes) -> list[x509.Certificate]:
         try:
@@ -77,7 +77,7 @@ class CertificateFiles:
         except ValueError:
             raise _unusable("tls_key", f"{self.key} holds no private key in PEM format") from None
 
-    def _context(self, read: CertificateBytes) -> ssl.SSLContext:
+    def _context(self, data: CertificateBytes) -> ssl.SSLContext:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.set_alpn_protocols(["http/1.1"])
@@ -85,13 +85,13 @@ class CertificateFiles:
             context.load_cert_chain(self.certificate, self.key, password="")
         except ssl.SSLError as error:
             raise _unusable("tls_certificate", f"OpenSSL refuses {self.certificate}: {error.reason or error}") from None
-        if read.client_authorities is not None:
+        if data.client_authorities is not None:
             try:
-                context.load_verify_locations(cadata=read.client_authorities.decode("ascii"))
+                context.load_verify_locations(cadata=data.client_authorities.decode("ascii"))
             except (ssl.SSLError, ValueError):
                 raise _unusable("tls_client_ca", f"{self.client_ca} holds no certificate in PEM format") from None
             context.verify_mode = ssl.CERT_REQUIRED
-        if self.read() != read:  # OpenSSL takes files, not bytes
+        if self.read() != data:  # OpenSSL takes files, not bytes
             raise _unusable("tls_certificate", f"{self.certificate} changed while it was read")
         return context
 
@@ -147,7 +147,7 @@ class CertificateWatch:
 
     def __init__(self, files: CertificateFiles) -> None:
         self._files = files
-        self._told: tuple[str, float] | None = None
+        self._last_report: tuple[str, float] | None = None
         self.current = files.load(files.read())
         _tell_in_use(self.current)
 
@@ -181,18 +181,18 @@ class CertificateWatch:
     def _tell_problem(self, problem: str | None) -> None:
         now = time.monotonic()
         if problem is None:
-            self._told = None
-        elif self._told is None or self._told[0] != problem or now - self._told[1] >= _REMIND_S:
-            self._told = problem, now
+            self._last_report = None
+        elif self._last_report is None or self._last_report[0] != problem or now - self._last_report[1] >= _REMIND_S:
+            self._last_report = problem, now
             _log.error("%s; the doors go on with the certificate valid until %s", problem, self.current.not_after)
 
 
 def _lateness(certificates: Certificates) -> str | None:
     now = datetime.now(timezone.utc)
-    left = certificates.not_after - now
+    time_left = certificates.not_after - now
     if now > certificates.not_after:
         return "tls_certificate has expired: clients refuse it"
-    if left < _LATE_SHARE * (certificates.not_after - certificates.not_before):
+    if time_left < _LATE_SHARE * (certificates.not_after - certificates.not_before):
         return "tls_certificate expires soon"
     return None
 

@@ -51,7 +51,7 @@ def make_service(settings: Settings) -> Service:
     limits = Limits(settings.allowance, metrics.count_limited)
 
     places = ScenePlaces(settings)
-    scenes = SceneStore(places.data, places.made, hides=partial(owners.hides, Kind.SCENE))
+    scenes = SceneStore(places.data, places.artifacts, hides=partial(owners.hides, Kind.SCENE))
     datasets = DatasetStore(
         settings.working_folder,
         open_storage(settings.artifacts),
@@ -81,7 +81,7 @@ def make_service(settings: Settings) -> Service:
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.require},
     )
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
-    imports = SceneImports(scenes, places.made, means)
+    imports = SceneImports(scenes, places.artifacts, means)
     return Service(
         settings=settings,
         life=life,
@@ -137,7 +137,7 @@ def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tr
             tracing.observe_result(result)
 
     # Scenes of its own: nothing is hidden from the pool, which works for everybody at once.
-    return RenderPool(SceneStore(places.data, places.made), config, observe)
+    return RenderPool(SceneStore(places.data, places.artifacts), config, observe)
 
 
 def oidc_tokens(settings: Settings) -> OidcTokens | None:

@@ -153,9 +153,9 @@ def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch):
     now = 1000.0
     monkeypatch.setattr("ultragray_client.exchange.time.monotonic", lambda: now)
     unanswered = Unanswered(newest_alone=False)
-    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=1, timeout_ms=5000.0))
-    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=2, timeout_ms=1.0))
-    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=3))
+    unanswered.add(rendering_pb2.RenderStreamRequest(sequence=1, timeout_ms=5000.0))
+    unanswered.add(rendering_pb2.RenderStreamRequest(sequence=2, timeout_ms=1.0))
+    unanswered.add(rendering_pb2.RenderStreamRequest(sequence=3))
     now += 0.05
     first, second, third = unanswered.again()
     assert first.timeout_ms == pytest.approx(4950.0)

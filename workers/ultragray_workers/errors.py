@@ -136,5 +136,5 @@ def job_not_found(job_id: str) -> JobNotFound:
 
 def known_names(kind: str, names: Sequence[str]) -> str:
     """The scenes or datasets that there are, the first few by name, for the message that another is not there."""
-    shown = ", ".join(names[:_NAMES_IN_MESSAGE]) + (", …" if len(names) > _NAMES_IN_MESSAGE else "")
-    return f"known {kind}s: {shown}" if names else f"there are no {kind}s yet"
+    listing = ", ".join(names[:_NAMES_IN_MESSAGE]) + (", …" if len(names) > _NAMES_IN_MESSAGE else "")
+    return f"known {kind}s: {listing}" if names else f"there are no {kind}s yet"

@@ -89,5 +89,5 @@ def read_picture(folder: Path, name: str, index: int) -> npt.NDArray[np.uint8] |
         return None
     if not 0 <= index < len(stack):
         return None
-    drawn = with_square_pixels(stack[index].astype(np.float32), probe, PICTURE_SIDE)
-    return np.rint(drawn).astype(np.uint8)
+    picture = with_square_pixels(stack[index].astype(np.float32), probe, PICTURE_SIDE)
+    return np.rint(picture).astype(np.uint8)

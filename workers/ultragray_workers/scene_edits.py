@@ -68,7 +68,7 @@ def label_scene(
     known = {int(label): name for label, name in names.items()}
     if label_map is not None:
         volume, affine = read_label_map(label_map)
-        labelled = label_by_map(loaded, volume, affine, names=known, map_to_scene=map_to_scene, within_mm=within_mm)
+        new_scene = label_by_map(loaded, volume, affine, names=known, map_to_scene=map_to_scene, within_mm=within_mm)
     else:
         painted = []
         for index, frame in enumerate(frames):
@@ -76,5 +76,5 @@ def label_scene(
                 labels = read_png(base64.b64decode(frame["labels"]), "labels")
             painted.append(PaintedFrame(np.array(frame["pose"]), labels))
         chosen = None if probe is None else from_dict(Probe, probe)
-        labelled = label_by_frames(loaded, painted, names=known, probe=chosen, within_mm=within_mm)
-    labelled.save(Path(output))
+        new_scene = label_by_frames(loaded, painted, names=known, probe=chosen, within_mm=within_mm)
+    new_scene.save(Path(output))

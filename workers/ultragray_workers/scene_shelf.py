@@ -143,7 +143,7 @@ class SceneShelf:
             return path
 
     def hold(self, name: str, *, counts: bool = True) -> AbstractContextManager[Path] | None:
-        """As `here`; the file stays until the context is left. It `counts` as a use of the cache."""
+        """The file of `here`, which stays until the context is left. It `counts` as a use of the cache."""
         if (path := self._near_file(name)) is not None:
             return nullcontext(path)
         if (placed := self._known_as(name)) is None:
@@ -183,7 +183,7 @@ class SceneShelf:
             raise FileNotFoundError(name) from None
 
     def bytes_of(self, name: str) -> int:
-        """Of the file of a scene; 0 where there is none."""
+        """The size of a scene's file; 0 where there is none."""
         return 0 if (placed := self._get(name)) is None else placed.bytes
 
     def sha256(self, name: str) -> str | None:
@@ -264,7 +264,7 @@ class SceneShelf:
         """Removes the objects that no name has; how many there were."""
         before = time.time() - older_than_s
         old = [one for one in self.storage.entries_in(self._key(OBJECTS)) if one.modified < before]
-        used = {placed.key for placed in self._found().values()} if old else set()  # after the objects were listed
+        used = {placed.key for placed in self._scan().values()} if old else set()  # after the objects were listed
         removed = 0
         for one in old:
             now = None if one.key in used else self.storage.entry(one.key)
@@ -313,7 +313,7 @@ class SceneShelf:
 
     def _scenes(self) -> dict[str, Placed]:
         if self.is_near:
-            return self._found()
+            return self._scan()
         if not self.is_usable:
             self.read()
         elif self._thread is None and time.monotonic() - self._tried_at_s > _OLD_S:
@@ -363,29 +363,29 @@ class SceneShelf:
     def _read(self) -> bool:
         """Whether the list could be read without a change by this process meanwhile, which it would undo."""
         changes, began_s = self._changes, time.monotonic()
-        found = self._found()
+        scenes = self._scan()
         with self._changing:
             if self._changes != changes:
                 return False
-            self._known, self._read_at_s = found, began_s
+            self._known, self._read_at_s = scenes, began_s
         return True
 
-    def _found(self) -> dict[str, Placed]:
+    def _scan(self) -> dict[str, Placed]:
         copied: dict[str, Placed] = {}
-        named: dict[str, Entry] = {}
+        entries: dict[str, Entry] = {}
         for entry in self.storage.entries_in(self._prefix):
             path = PurePosixPath(entry.key)
             if is_scene_name(path.stem) and path.suffix in SUFFIXES:
                 if path.suffix == SUFFIX or path.stem not in copied:
                     copied[path.stem] = Placed(entry.key, entry.version, entry.bytes, None)
             elif is_scene_name(path.stem) and path.suffix == ENTRY_SUFFIX:
-                named[path.stem] = entry
-        known = {name: self._entries[name] for name in named if name in self._entries}
-        new = [name for name, entry in named.items() if name not in known or known[name][0] != entry.version]
+                entries[path.stem] = entry
+        known = {name: self._entries[name] for name in entries if name in self._entries}
+        new = [name for name, entry in entries.items() if name not in known or known[name][0] != entry.version]
         if new:
             with ThreadPoolExecutor(_READ_AT_ONCE) as threads:
-                read = threads.map(self._read_entry, (named[name].key for name in new))
-                known |= {name: (named[name].version, placed) for name, placed in zip(new, read, strict=True)}
+                places = threads.map(self._read_entry, (entries[name].key for name in new))
+                known |= {name: (entries[name].version, placed) for name, placed in zip(new, places, strict=True)}
         self._entries = known
         return {name: placed for name, (_, placed) in known.items() if placed is not None} | copied
 
@@ -444,7 +444,7 @@ _OBJECT_BYTES_PER_TEXT_BYTE = 30  # of the most wasteful metadata: empty lists i
 
 
 def floats_per_gaussian(info: SceneInfo) -> int:
-    """Of a scene's parameters."""
+    """The number of a Gaussian's parameters in a scene."""
     return 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
 
 
@@ -489,12 +489,12 @@ class KeptHeaders:
     def get(self, name: str, version: Hashable) -> SceneHeader | None:
         """The header of a scene if it is of this version; one of another version is dropped."""
         with self._lock:
-            kept = self._kept.get(name)
-            if kept is None or kept[0] != version:
+            entry = self._kept.get(name)
+            if entry is None or entry[0] != version:
                 self._drop(name)
                 return None
             self._kept.move_to_end(name)
-            return kept[1]
+            return entry[1]
 
     def keep(self, name: str, version: Hashable, header: SceneHeader) -> None:
         with self._lock:
@@ -509,10 +509,10 @@ class KeptHeaders:
             self._drop(name)
 
     def _drop(self, name: str) -> None:
-        if (kept := self._kept.pop(name, None)) is not None:
-            self._bytes -= _described_bytes(kept[1])
+        if (entry := self._kept.pop(name, None)) is not None:
+            self._bytes -= _described_bytes(entry[1])
 
 
 def _described_bytes(header: SceneHeader) -> int:
-    """Of a scene file without its Gaussians, as what is read from it: text becomes objects."""
+    """The memory of a header in bytes: its text takes more as objects."""
     return header.training_poses.nbytes + _OBJECT_BYTES_PER_TEXT_BYTE * header.text_bytes

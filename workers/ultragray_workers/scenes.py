@@ -63,11 +63,11 @@ class SceneStore:
 
     def require(self, text: str) -> str:
         """The name of the scene that is asked for. Raises SceneNotFound, also for one that no scene can have."""
-        return self._found(text)[0].name
+        return self._resolve(text)[0].name
 
     def path(self, text: str) -> Path:
         """The file of a scene, on this host from now on. Raises SceneNotFound, StorageFull."""
-        reference, shelf = self._found(text)
+        reference, shelf = self._resolve(text)
         try:
             return shelf.fetch(reference.name)
         except FileNotFoundError:
@@ -82,15 +82,15 @@ class SceneStore:
 
     def header(self, text: str) -> SceneHeader:
         """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
-        reference, shelf = self._found(text)
+        reference, shelf = self._resolve(text)
         if shelf.here(reference.name) is not None:
             return self.versioned_header(text)[1]
         try:
             version = shelf.version(reference.name)  # before reading, so that a change meanwhile counts as newer
-            if (kept := self._headers.get(reference.name, version)) is None:
-                kept = shelf.header(reference.name)
-                self._headers.keep(reference.name, version, kept)
-            return kept
+            if (header := self._headers.get(reference.name, version)) is None:
+                header = shelf.header(reference.name)
+                self._headers.keep(reference.name, version, header)
+            return header
         except FileNotFoundError:
             raise self._not_found(text) from None
 
@@ -133,8 +133,8 @@ class SceneStore:
     def hold(self, name: str) -> AbstractContextManager[Path] | None:
         """The file of a scene, which stays on this host until the context is left; None where it is not here now."""
         for shelf in self.shelves if is_scene_name(name) else ():
-            if (held := shelf.hold(name)) is not None or shelf.knows(name):
-                return held
+            if (hold := shelf.hold(name)) is not None or shelf.knows(name):
+                return hold
         return None
 
     def sha256(self, text: str) -> str:
@@ -142,7 +142,7 @@ class SceneStore:
 
         Raises SceneNotFound, SceneFileInvalid.
         """
-        reference, shelf = self._found(text)
+        reference, shelf = self._resolve(text)
         known = shelf.sha256(reference.name)
         return self._hash_of_file(reference.name, self.path(text))[1] if known is None else known
 
@@ -159,22 +159,22 @@ class SceneStore:
         self._headers.drop(name)
         self._hashes.pop(name, None)
 
-    def _found(self, text: str) -> tuple[SceneReference, SceneShelf]:
+    def _resolve(self, text: str) -> tuple[SceneReference, SceneShelf]:
         """The shelf of the scene that is asked for, with the content that is asked for. Raises SceneNotFound."""
         reference = SceneReference.of(text)
         if reference is None or self.hides(reference.name) or (shelf := self.shelf_of(reference.name)) is None:
             raise self._not_found(text)
         if reference.pin is not None:
-            found = shelf.sha256(reference.name)
-            if found is None:
+            sha256 = shelf.sha256(reference.name)
+            if sha256 is None:
                 try:
-                    _, found = self._hash_of_file(reference.name, shelf.fetch(reference.name))
+                    _, sha256 = self._hash_of_file(reference.name, shelf.fetch(reference.name))
                 except FileNotFoundError:
                     raise self._not_found(text) from None
-            if not reference.fits(found):
+            if not reference.fits(sha256):
                 raise SceneNotFound(
                     f"the scene {reference.name!r} no longer has the content {reference.pin}; it is now "
-                    f"{reference.name}@{found}",
+                    f"{reference.name}@{sha256}",
                     field="scene",
                 )
         return reference, shelf

@@ -223,6 +223,6 @@ class _Comparison:
 
 
 def _metrics(evaluation: Evaluation) -> dict[str, float]:
-    """Of the only frame."""
+    """The metrics of the only frame."""
     own = {name: getattr(evaluation.frames[0], name) for name in _COMPARED}
     return {**own, "histogram_distance": evaluation.frame_speckle[0].histogram_distance}

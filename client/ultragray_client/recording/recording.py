@@ -123,12 +123,12 @@ _Work: TypeAlias = tuple[Callable[[], None], "SimpleQueue[BaseException | None]"
 
 
 def _do_all(work: SimpleQueue[_Work | None]) -> None:
-    while (asked := work.get()) is not None:
-        task, done = asked
+    while (item := work.get()) is not None:
+        task, done = item
         try:
             task()
         except BaseException as error:
             done.put(error)
         else:
             done.put(None)
-        del asked, task, done  # else the recording would not end while the next one is waited for
+        del item, task, done  # else the recording would not end while the next one is waited for

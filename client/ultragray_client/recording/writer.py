@@ -49,8 +49,8 @@ class RosRecording:
             self._origin = origin
             self._tell_origin(origin, time_ns)
         self._write("probe_pose", ros.POSE, ros.pose_message(pose, time_ns), time_ns)
-        told = ros.figures_message(figures, time_ns, name=origin["scene"], hardware_id=origin["scene_sha256"])
-        self._write("confidence", ros.DIAGNOSTICS, told, time_ns)
+        message = ros.figures_message(figures, time_ns, name=origin["scene"], hardware_id=origin["scene_sha256"])
+        self._write("confidence", ros.DIAGNOSTICS, message, time_ns)
         for output, pixels in images.items():
             self._write(output, ros.IMAGE, ros.image_message(pixels, time_ns), time_ns)
         if LABELS in images:

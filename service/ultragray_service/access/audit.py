@@ -81,8 +81,8 @@ class AskedDatabase:
         self._is_away = False
 
     @contextmanager
-    def asked(self) -> Iterator[None]:
-        """The body asks; it may fail, and is to be tried again."""
+    def attempt(self) -> Iterator[None]:
+        """The body queries the database; where it fails, it is tried again later."""
         try:
             yield
         except (UltragrayError, SQLAlchemyError) as error:
@@ -128,17 +128,17 @@ class AuditLog:
         """Counts something that happens often; a refusal is told the first time; of nobody without its target."""
         if entry.who == NOBODY:
             entry = replace(entry, target="")
-        seen = self._tallies.get(entry)
-        if seen is None:
+        tally = self._tallies.get(entry)
+        if tally is None:
             if self._different[entry.who] >= _MAX_TALLIES:
                 entry = Entry(entry.who, "*", "*", "", entry.result)
-                seen = self._tallies.get(entry)
-            self._different[entry.who] += seen is None
-        if seen is None and entry.result != OK:
+                tally = self._tallies.get(entry)
+            self._different[entry.who] += tally is None
+        if tally is None and entry.result != OK:
             self.tell(entry)
             self._tallies[entry] = 0
         else:
-            self._tallies[entry] = (seen or 0) + 1
+            self._tallies[entry] = (tally or 0) + 1
 
     @contextmanager
     def refusals(self, who: str, address: str, operation: Operation, target: str) -> Iterator[None]:
@@ -184,7 +184,7 @@ class AuditLog:
                 if stopping or time.monotonic() - tallied_s >= TALLY_INTERVAL_S:
                     tallied_s = time.monotonic()
                     self._tell_tallies()
-                with self._database.asked():
+                with self._database.attempt():
                     self._write()
 
     def _tell_tallies(self) -> None:
@@ -235,10 +235,10 @@ def read_audit(
     if what is not None:
         chosen = chosen.where(sa.or_(rows.what == what, rows.what.startswith(f"{what}.", autoescape=True)))
     with engine.connect() as connection:
-        found = connection.execute(chosen.order_by(rows.number.desc()).limit(limit)).all()
+        records = connection.execute(chosen.order_by(rows.number.desc()).limit(limit)).all()
     return [
         Entry(row.who, row.address, row.what, row.target, row.result, json.loads(row.facts), row.at_s)
-        for row in reversed(found)
+        for row in reversed(records)
     ]
 
 
@@ -281,5 +281,5 @@ async def audit_entries(
     if not 1 <= limit <= MAX_ENTRIES:
         raise InvalidArgument(f"limit must be an integer from 1 to {MAX_ENTRIES}, got {limit}", field="limit")
     since_s = time.time() - since_hours * _HOUR_S
-    found = await asyncio.to_thread(read_audit, engine, since_s=since_s, who=who, what=what, limit=limit)
-    return AuditEntries([AuditEntry.of(entry) for entry in found])
+    entries = await asyncio.to_thread(read_audit, engine, since_s=since_s, who=who, what=what, limit=limit)
+    return AuditEntries([AuditEntry.of(entry) for entry in entries])

@@ -88,10 +88,10 @@ class KeyStore:
     def revoke(self, name_or_id: str) -> list[Key]:
         """Revokes the key of an id, or all of a name; those that were valid. Raises InvalidArgument for none."""
         now_s = time.time()
-        found = [key for key in self.keys().values() if name_or_id in (key.id, key.name)]
-        if not found:
+        matches = [key for key in self.keys().values() if name_or_id in (key.id, key.name)]
+        if not matches:
             raise InvalidArgument(f"there is no key of the name or id {name_or_id!r}", field="name")
-        revoked = [key for key in found if key.revoked_at_s is None]
+        revoked = [key for key in matches if key.revoked_at_s is None]
         with self._engine.begin() as connection:
             chosen = KEYS.c.id.in_([key.id for key in revoked])
             connection.execute(sa.update(KEYS).where(chosen).values(revoked_at_s=now_s))
@@ -113,12 +113,12 @@ class KeyStore:
 
 
 def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
-    found = {}
+    keys = {}
     for row in connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at_s, KEYS.c.id)).mappings():
         values = {**row, "role": Role(row["role"]), "limits": json.loads(row["limits"] or "{}")}
         digest = bytes.fromhex(values.pop("digest"))
-        found[digest] = Key(**values)
-    return found
+        keys[digest] = Key(**values)
+    return keys
 
 
 class KnownKeys:
@@ -153,8 +153,8 @@ class KnownKeys:
 
     def take_uses(self) -> dict[str, float]:
         """When keys were used last, by their ids, since the last call."""
-        taken, self._used_at_s = self._used_at_s, {}
-        return dict(taken)  # a request may still be writing into the other one
+        uses, self._used_at_s = self._used_at_s, {}
+        return dict(uses)  # a request may still be writing into the other one
 
 
 # The copy in memory of what the jobs' database knows of keys, owners and registrations, a second or two old.
@@ -198,7 +198,7 @@ class Snapshot:
         rounds, round_number = Rounds(f"the watch over {_COPIED}", _log), 0
         while not self._stop.wait(INTERVAL_S):
             round_number += 1
-            with rounds.round(), self._database.asked():
+            with rounds.round(), self._database.attempt():
                 self.refresh()
                 if round_number % _USES_EVERY == 0:
                     KeyStore(self._engine).note_uses(self._keys.take_uses())

@@ -40,12 +40,12 @@ class Rate:
         item = RateLimitItemPerSecond(per_s)
         if self._windows.hit(item, client, cost=count):
             return 0.0
-        first_leaves_s, left = self._windows.get_window_stats(item, client)
+        first_leaves_s, remaining = self._windows.get_window_stats(item, client)
         wait_s = first_leaves_s - time.time()
         if wait_s > WINDOW_S:  # the clock was set back
             self._windows.clear(item, client)
             return self.take(client, per_s, count)
-        return (max(0.0, wait_s) if count <= left + 1 else WINDOW_S) + _MARGIN_S
+        return (max(0.0, wait_s) if count <= remaining + 1 else WINDOW_S) + _MARGIN_S
 
     async def wait(self, client: str, per_s: int, count: int = 1, *, until: float | None) -> float:
         """Takes so many when there are, first come, first served: 0.0.

@@ -55,17 +55,17 @@ def claim_at(claims: Mapping[str, Any], path: str) -> Any:
     """The value of a claim: of its whole name, which may hold dots, else along its parts."""
     if path in claims:
         return claims[path]
-    found: Any = claims
+    value: Any = claims
     for part in path.split("."):
-        found = found.get(part) if isinstance(found, dict) else None
-    return found
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
 
 
 def highest_role(values: Any, roles: Mapping[str, Role]) -> Role | None:
     """The highest role that a claim gives: a list of values, or a text of several with spaces between them."""
-    listed = values.split() if isinstance(values, str) else values if isinstance(values, list) else []
-    given = [roles[value] for value in listed if isinstance(value, str) and value in roles]
-    return max(given, key=list(Role).index, default=None)
+    names = values.split() if isinstance(values, str) else values if isinstance(values, list) else []
+    claimed_roles = [roles[value] for value in names if isinstance(value, str) and value in roles]
+    return max(claimed_roles, key=list(Role).index, default=None)
 
 
 DISCOVERY_PATH = "/.well-known/openid-configuration"
@@ -76,7 +76,7 @@ _CONNECT_TIMEOUT_S = 5.0
 _ANSWER_TIMEOUT_S = 15.0
 _LARGEST_ANSWER_BYTES = 2**19
 _LEAST_RSA_BITS = 2048
-_MAX_ASKED = 100
+_MAX_QUEUE = 100
 _SIGNATURES = {  # that a key of a kind can make, by the class that JSON Web Keys know it as; nothing symmetric
     "RSA": ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512"),
     "P-256": ("ES256",),
@@ -117,7 +117,7 @@ class Issuer:
         self._opener = urllib.request.build_opener(urllib.request.HTTPSHandler(context=tls), _NoRedirects)
         self._published: list[Any] = []
         # Keys that tokens named and that are not known: to be fetched, being fetched, and not found by the last fetch.
-        self._asked: set[str | None] = set()
+        self._queue: set[str | None] = set()
         self._fetching: set[str | None] = set()
         self._absent: set[str | None] = set()
         self._wanted = asyncio.Event()
@@ -127,15 +127,15 @@ class Issuer:
 
     def key(self, key_id: str | None) -> SigningKey:
         """The key of an id; None: the only one. Raises Unauthenticated, IssuerUnavailable where it is not known yet."""
-        found = self.keys.get(key_id)
-        if found is not None:
-            return found
+        known_key = self.keys.get(key_id)
+        if known_key is not None:
+            return known_key
         if self.problem is not None:
             raise IssuerUnavailable("the token cannot be checked: its issuer does not answer", field="Authorization")
-        if key_id in self._absent or len(self._asked) >= _MAX_ASKED:
+        if key_id in self._absent or len(self._queue) >= _MAX_QUEUE:
             raise Unauthenticated("the token is signed with a key that its issuer does not have", field="Authorization")
         if key_id not in self._fetching:
-            self._asked.add(key_id)
+            self._queue.add(key_id)
             self._wanted.set()
         raise IssuerUnavailable(
             "the token names a new key of its issuer, and the keys are being fetched", field="Authorization"
@@ -154,7 +154,7 @@ class Issuer:
 
     async def _look(self) -> None:
         self._wanted.clear()
-        self._fetching, self._asked = self._asked, set()
+        self._fetching, self._queue = self._queue, set()
         problem = await asyncio.to_thread(self._fetch)
         self._absent, self._fetching = self._fetching - self.keys.keys(), set()
         if problem != self.problem:
@@ -173,7 +173,7 @@ class Issuer:
             self.endpoints = _endpoints(discovered)
             published = self._get(check_url(discovered["jwks_uri"], "jwks_uri"))["keys"]
             if published != self._published:
-                keys = dict(found for one in published if (found := _usable(one)) is not None)
+                keys = dict(entry for one in published if (entry := _usable(one)) is not None)
                 if len(keys) == 1:
                     keys[None] = next(iter(keys.values()))
                 self.keys, self._published = keys, published
@@ -200,7 +200,7 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 
 def _endpoints(discovered: Any) -> Endpoints | None:
-    """Those that an issuer publishes; None: it has none. Raises InvalidArgument for one that is not encrypted."""
+    """The endpoints of an issuer; None: it publishes none. Raises InvalidArgument for one that is not encrypted."""
     names = ("authorization_endpoint", "token_endpoint")
     if any(name not in discovered for name in names):
         return None
@@ -211,8 +211,8 @@ def _usable(published: Any) -> tuple[str | None, SigningKey] | None:
     """Id and key of a JSON Web Key that tokens may be signed with; None: it is for something else."""
     kind = published["kty"] if published["kty"] == "RSA" else published.get("crv")
     algorithms = _SIGNATURES.get(kind, ())
-    if (named := published.get("alg")) is not None:
-        algorithms = tuple(one for one in algorithms if one == named)
+    if (algorithm := published.get("alg")) is not None:
+        algorithms = tuple(one for one in algorithms if one == algorithm)
     if not algorithms or published.get("use", "sig") != "sig":
         return None
     try:

@@ -131,7 +131,7 @@ class Claim:
         self.is_made = False  # told by who makes it, from any thread
 
     async def take(self, is_there: Callable[[str | None], Awaitable[bool]]) -> bool:
-        """As `Owners.claim`; what is to be private is hidden from here on."""
+        """Claims the name, as `Owners.claim` does; what is to be private is hidden from here on."""
         if self._taken_at_s is None:
             self._taken_at_s = time.monotonic()
         return await self._owners.claim(self._kind, self._name, self._ownership, is_there)

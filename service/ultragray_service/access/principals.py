@@ -73,7 +73,7 @@ NAMES = tuple(item.name for item, _ in annotated_fields(Allowance))
 def read_limits(texts: Sequence[str]) -> dict[str, Number | None]:
     """The limits that `frames_per_s=30` or `streams=none` give. Raises InvalidArgument."""
     annotations = {item.name: annotation for item, annotation in annotated_fields(Allowance)}
-    found: dict[str, Number | None] = {}
+    limits: dict[str, Number | None] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if name not in annotations or not equals:
@@ -81,9 +81,9 @@ def read_limits(texts: Sequence[str]) -> dict[str, Number | None]:
                 f"limit must be NAME=NUMBER or NAME={_UNLIMITED}, with a NAME of {', '.join(NAMES)}, got {text!r}",
                 field=_LIMIT_FIELD,
             )
-        read: Any = None if value == _UNLIMITED else from_text(value, annotations[name])
-        found[name] = getattr(Allowance(**{name: read}), name)
-    return found
+        number: Any = None if value == _UNLIMITED else from_text(value, annotations[name])
+        limits[name] = getattr(Allowance(**{name: number}), name)
+    return limits
 
 
 class Role(str, Enum):
@@ -171,18 +171,18 @@ def is_loopback(host: str) -> bool:
 
 
 def parse_allowed(entries: Sequence[str]) -> tuple[tuple[_Network, Role], ...]:
-    found = []
+    networks = []
     for entry in entries:
         address, _, role = entry.partition("=")
         try:
-            found.append((ipaddress.ip_network(address.strip()), Role(role.strip())))
+            networks.append((ipaddress.ip_network(address.strip()), Role(role.strip())))
         except ValueError:
             raise InvalidArgument(
                 f"{_ALLOWED_FIELD} must name addresses or networks with a role ({', '.join(Role)}), such as "
                 f"10.0.0.7=reader or 10.0.0.0/24=reader, got {entry!r}",
                 field=_ALLOWED_FIELD,
             ) from None
-    return tuple(found)
+    return tuple(networks)
 
 
 class AddressRoles:

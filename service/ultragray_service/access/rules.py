@@ -208,8 +208,8 @@ class HttpRules:
                 method, _, path = route.partition(" ")
                 self._routes.setdefault(method, []).append((path, operation))
         self._compiled = {
-            method: [(compile_path(path)[0], operation) for path, operation in found]
-            for method, found in self._routes.items()
+            method: [(compile_path(path)[0], operation) for path, operation in entries]
+            for method, entries in self._routes.items()
         }
 
     def find(self, method: str, path: str) -> tuple[Operation, str] | None:
@@ -220,14 +220,14 @@ class HttpRules:
         return None
 
     def require_all(self, routes: Iterable[tuple[str, str]]) -> None:
-        known = {(method, path) for method, found in self._routes.items() for path, _ in found}
+        known = {(method, path) for method, entries in self._routes.items() for path, _ in entries}
         missing = sorted({(method, path) for method, path in routes if method not in ("HEAD", "OPTIONS")} - known)
         if missing:
             raise LookupError(f"access/rules.py does not say who may ask for {missing}")
 
     def routes(self) -> Iterator[tuple[str, str, Operation]]:
-        for method, found in self._routes.items():
-            for path, operation in found:
+        for method, entries in self._routes.items():
+            for path, operation in entries:
                 yield method, path, operation
 
 

@@ -85,21 +85,21 @@ _COMMANDS = {  # by the panels of the help
 
 @cache
 def _own() -> dict[str, Entry]:
-    found = _COMMANDS.items()
-    return {name: Entry(name, app, panel, text) for panel, of in found for name, (app, text) in of.items()}
+    panels = _COMMANDS.items()
+    return {name: Entry(name, app, panel, text) for panel, of in panels for name, (app, text) in of.items()}
 
 
 @cache
 def _all() -> dict[str, Entry]:
     """The own entries, then those of other packages; to find these takes some hundredths of a second."""
-    found = dict(_own())
+    entries = dict(_own())
     for point in entry_points(group=_PLUGINS):
         try:
             for entry in point.load():
-                found.setdefault(entry.name, entry)
+                entries.setdefault(entry.name, entry)
         except ImportError as error:
             warn(f"the commands of {point.value} are left out: {error}")
-    return found
+    return entries
 
 
 def _entry(name: str) -> Entry | None:
@@ -139,9 +139,9 @@ class _Commands(TyperGroup):
         return None if entry is None else TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, found, rest = super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
         entry = _entry(name or "")
-        return name, found if entry is None else entry.load(), rest
+        return name, command if entry is None else entry.load(), rest
 
     def main(
         self,
@@ -152,11 +152,11 @@ class _Commands(TyperGroup):
         windows_expand_args: bool = True,
         **extra: Any,
     ) -> Any:
-        as_asked = (args, prog_name or "ultragray", complete_var, False, windows_expand_args)  # also by `python -m`
+        arguments = (args, prog_name or "ultragray", complete_var, False, windows_expand_args)  # also by `python -m`
         if not standalone_mode:
-            return super().main(*as_asked, **extra)
+            return super().main(*arguments, **extra)
         try:
-            code = super().main(*as_asked, **extra)
+            code = super().main(*arguments, **extra)
         except typer.TyperException as error:
             if type(error).__name__ != "NoArgsIsHelpError":  # the help has been printed
                 _say_error(_in_one_line(error))

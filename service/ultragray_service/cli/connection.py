@@ -131,18 +131,18 @@ class Connection:
 
     def listed(self, route: str, key: str, limit: int | None = None, **query: str) -> list[dict[str, Any]]:
         """The items of all pages of a list, at most `limit`; `key` names them in a page."""
-        found: list[dict[str, Any]] = []
+        items: list[dict[str, Any]] = []
         token: str | None = ""
-        while limit is None or len(found) < limit:
-            size = _PAGE if limit is None else min(limit - len(found), _PAGE)
+        while limit is None or len(items) < limit:
+            size = _PAGE if limit is None else min(limit - len(items), _PAGE)
             page = self.json("GET", f"{route}?{urlencode({**query, 'page_size': size, 'page_token': token})}")
             if not isinstance(page, dict) or key not in page:
                 raise self._foreign()
-            found += page[key]
+            items += page[key]
             token = page.get("next_page_token")
             if not token:
                 break
-        return found
+        return items
 
     def open(
         self,
@@ -201,7 +201,7 @@ class Connection:
     def _ask(
         self, method: str, route: str, body: bytes | _Counted | None, headers: Mapping[str, str], timeout_s: float
     ) -> http.client.HTTPResponse:
-        sent = body if isinstance(body, _Counted) else None
+        upload = body if isinstance(body, _Counted) else None
         try:
             where = self._parts.netloc
             connection = (
@@ -214,15 +214,15 @@ class Connection:
                 try:
                     connection.request(method, self._parts.path.rstrip("/") + route, body, {**self._headers, **headers})
                 except (BrokenPipeError, ConnectionResetError, ssl.SSLError):
-                    if sent is None or not sent.is_begun:
+                    if upload is None or not upload.is_begun:
                         raise
                 answer = connection.getresponse()
                 unless_answered.pop_all()
             if connection.sock is not None:  # the answer has it
                 connection.sock.close()
         except (OSError, http.client.HTTPException) as error:
-            if sent is not None and sent.is_begun:
-                raise NotReady(f"{self.address} closed the connection while {sent.name} was sent") from error
+            if upload is not None and upload.is_begun:
+                raise NotReady(f"{self.address} closed the connection while {upload.name} was sent") from error
             raise self._unreachable(error) from error
         if answer.status >= 300:
             with answer:
@@ -320,9 +320,9 @@ def with_connection(command: Callable[..., None]) -> Callable[..., None]:
     options = parameters_in(_connected)
 
     @wraps(command)
-    def run(**given: Any) -> None:
-        connection = _connected(**{one.name: given.pop(one.name) for one in options})
-        command(connection, **given)
+    def run(**values: Any) -> None:
+        connection = _connected(**{one.name: values.pop(one.name) for one in options})
+        command(connection, **values)
 
     return with_parameters(run, [*(one for one in parameters_in(command) if one.name != "connection"), *options])
 
@@ -344,8 +344,8 @@ class Resource:
         @self.app.command("list", help=meaning, epilog=examples(line, *more or (f"{line} --json | jq '.[].name'",)))
         @with_connection
         def list_all(connection: Connection, json: Json = False) -> None:
-            found = connection.listed(f"/v1/{self.kind}", self.kind)
-            tell_table(self.columns, found, as_json=json)
+            items = connection.listed(f"/v1/{self.kind}", self.kind)
+            tell_table(self.columns, items, as_json=json)
 
     def add_show(self, meaning: str, *more: str) -> None:
         def show(connection: Connection, name: str, json: Json = False) -> None:

@@ -66,25 +66,25 @@ class AskedEdits(Contract):
 
     def listed(self) -> tuple[Edit, ...]:
         """Raises InvalidArgument."""
-        found: list[Edit] = [] if self.edits is None else list(read_edits(self.edits))
+        edits: list[Edit] = [] if self.edits is None else list(read_edits(self.edits))
         if self.cut_box_mm is not None:
             low, high = (_triple(corner) for corner in parse_box(self.cut_box_mm))
-            found.append(CutEdit(shape=BoxShape(min_mm=low, max_mm=high)))
+            edits.append(CutEdit(shape=BoxShape(min_mm=low, max_mm=high)))
         if self.merge is not None:
-            found.append(MergeEdit(scene=self.merge))
+            edits.append(MergeEdit(scene=self.merge))
         if (self.insert is None) != (self.at_mm is None):
             raise InvalidArgument("--insert and --at-mm belong together", field="insert")
         if self.insert is not None and self.at_mm is not None:
             ball = SphereShape(centre_mm=_triple(parse_numbers(self.at_mm, 3, "at_mm")), radius_mm=self.radius_mm)
-            found.append(InsertEdit(shape=ball, tissue=self.insert, seed=self.seed))
+            edits.append(InsertEdit(shape=ball, tissue=self.insert, seed=self.seed))
         if self.lesions is not None:
-            found.append(LesionsEdit(count=self.lesions, seed=self.seed))
+            edits.append(LesionsEdit(count=self.lesions, seed=self.seed))
         if self.gaussians is not None:
-            found.append(ThinEdit(gaussian_count=self.gaussians))
-        if not found:
+            edits.append(ThinEdit(gaussian_count=self.gaussians))
+        if not edits:
             known = "--edits, --cut-box-mm, --merge, --insert with --at-mm, --lesions, --gaussians"
             raise InvalidArgument(f"at least one edit must be given: {known}", field="edits")
-        return check_edits(found)
+        return check_edits(edits)
 
 
 def _triple(values: Any) -> tuple[float, float, float]:
@@ -110,8 +110,8 @@ def edit(
     """The scene stays as it is: the new one names it as its parent. Scenes that are merged are files."""
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
     read_header(scene)
-    asked = edits.listed()
-    for name in scenes_named(asked):
+    edit_list = edits.listed()
+    for name in scenes_named(edit_list):
         read_header(name)
 
     from ultragray import GaussianScene
@@ -119,9 +119,9 @@ def edit(
     from ultragray.learn.editing.editor import edit_scene
 
     with working("editing …"):
-        others = {name: GaussianScene.load(name) for name in scenes_named(asked)}
+        others = {name: GaussianScene.load(name) for name in scenes_named(edit_list)}
         parents = {path.stem: file_sha256(path) for path in (scene, *map(Path, others))}
-        edited = edit_scene(GaussianScene.load(scene), asked, others=others, names=parents)
+        edited = edit_scene(GaussianScene.load(scene), edit_list, others=others, names=parents)
     edited.save(output)
     document = {
         "output": str(output),
@@ -180,14 +180,14 @@ def from_labels(
 ) -> None:
     """All of it counts as not recorded, until a training refines it: ultragray train --start-scene."""
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
-    asked = read_recipe(tissue, labels, ct, **recipe)
+    checked_recipe = read_recipe(tissue, labels, ct, **recipe)
     path = None if poses is None else load_poses(poses)
 
     from ultragray.learn.synthesis.scene import scene_from_labels
 
     with working("making the scene …"):
-        made = scene_from_labels(asked, poses=path)
-    made.save(output)
-    names = [*made.info.label_names.values()]
-    document = {"output": str(output), "gaussian_count": made.gaussian_count, "made_labels": names}
-    tell(f"wrote {output}: {made.gaussian_count:,} Gaussians, {', '.join(names)}", document, as_json=json)
+        scene = scene_from_labels(checked_recipe, poses=path)
+    scene.save(output)
+    names = [*scene.info.label_names.values()]
+    document = {"output": str(output), "gaussian_count": scene.gaussian_count, "made_labels": names}
+    tell(f"wrote {output}: {scene.gaussian_count:,} Gaussians, {', '.join(names)}", document, as_json=json)

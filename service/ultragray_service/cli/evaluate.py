@@ -87,26 +87,26 @@ def evaluate(
     from ultragray.scene.gaussians import GaussianScene
 
     loaded = GaussianScene.load(scene).to(render_device(backend))
-    read = read_dataset(sweep, source)
-    frames = read.val if split is Split.VAL else read.train
+    dataset = read_dataset(sweep, source)
+    frames = dataset.val if split is Split.VAL else dataset.train
     require_frames(frames)
-    check_scene_fits(loaded.info, read)
+    check_scene_fits(loaded.info, dataset)
     with working(f"measuring {len(frames)} frames …"):
         evaluation = evaluate_scene(loaded, frames, backend=backend)
         reliability = measure_reliability(loaded, frames, backend=backend)
         sizes = CorrectionSizes.of(loaded)
         held_out = None
         if split is Split.VAL:
-            held_out = score_held_out(loaded, read, evaluation, register=register, backend=backend)
+            held_out = score_held_out(loaded, dataset, evaluation, register=register, backend=backend)
     if json:
         figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
         figures |= {} if sizes is None else {"pose_corrections": sizes.to_dict()}
         figures |= {} if held_out is None else {"held_out": held_out.to_dict()}
-        typer.echo(to_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures}))
+        typer.echo(to_json({"scene": str(scene), "dataset": dataset.name, "split": split.value, **figures}))
     else:
         rows = {} if held_out is None else {f"{scene.stem}, {name}": one for name, one in held_out.rows.items()}
-        shown = rows if len(rows) > 1 else {scene.stem: evaluation}
-        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", shown)
+        table = rows if len(rows) > 1 else {scene.stem: evaluation}
+        print_metrics(f"{dataset.name}, {len(frames)} {split.value} frames", table)
         print_speckle({scene.stem: evaluation})
         if reliability is not None:
             typer.echo(_in_words(reliability))

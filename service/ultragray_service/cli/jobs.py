@@ -207,12 +207,12 @@ def _submit(
 def _add_submit_command(kind: str, cls: type[Specification]) -> None:
     common = [one for one in parameters_in(_submit) if one.name not in ("connection", "kind", "specification")]
 
-    def submit(connection: Connection, **given: Any) -> None:
-        values = values_of(cls, given)
-        if {"sampler", "poses"} <= given.keys() and not {"sampler", "poses"} & values.keys():
+    def submit(connection: Connection, **options: Any) -> None:
+        values = values_of(cls, options)
+        if {"sampler", "poses"} <= options.keys() and not {"sampler", "poses"} & values.keys():
             values["sampler"] = TrainingSampler()
         document = {name: _as_json(value) for name, value in values.items()}
-        _submit(connection, kind, document, **{parameter.name: given[parameter.name] for parameter in common})
+        _submit(connection, kind, document, **{parameter.name: options[parameter.name] for parameter in common})
 
     summary = inspect.getdoc(cls) or ""
     command = with_connection(with_parameters(submit, [*parameters_of(cls), *common]))
@@ -250,9 +250,9 @@ def follow(connection: Connection, job_id: str, *, as_json: bool = False) -> Non
 def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """The job in its final state; a service that was restarted in the meantime is asked again."""
     connection.json("GET", route("jobs", job_id))  # nobody there, or no such job: said at once
-    seen = time.monotonic()
+    contact_s = time.monotonic()
     while True:
-        asked, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
+        request_s, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
         try:
             for event in connection.events(route("jobs", job_id, "events"), "progress"):
                 job: dict[str, Any] = event
@@ -261,9 +261,9 @@ def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]
                     return job
         except NotReady as error:
             gone = error
-        if (now := time.monotonic()) - asked > _HELD_S:
-            seen = now  # the service was there until now, though perhaps nothing changed
-        elif now - seen > _GONE_S:
+        if (now := time.monotonic()) - request_s > _HELD_S:
+            contact_s = now  # the service was there until now, though perhaps nothing changed
+        elif now - contact_s > _GONE_S:
             raise gone
         time.sleep(_RETRY_S)
 
@@ -303,7 +303,7 @@ def amount(job: dict[str, Any]) -> str:
 
 
 def figures(job: dict[str, Any]) -> str:
-    shown: dict[str, Callable[[Any], str]] = {
+    formats: dict[str, Callable[[Any], str]] = {
         "waits_for": "waits for {}".format,
         "method": lambda method: f"{method}, method {progress['method_number']} of {progress['methods']}",
         "loss": "loss {:.4f}".format,
@@ -313,7 +313,7 @@ def figures(job: dict[str, Any]) -> str:
         "val_psnr_db": "held out {:.2f} dB".format,
     }
     progress = job["progress"]
-    return " · ".join(words(progress[name]) for name, words in shown.items() if progress[name] is not None)
+    return " · ".join(words(progress[name]) for name, words in formats.items() if progress[name] is not None)
 
 
 def results(job: dict[str, Any]) -> str:

@@ -88,14 +88,14 @@ def label(
         loaded = GaussianScene.load(scene)
         if volume is not None:
             to_scene = None if link is None else link.base_to_scene
-            labelled = label_by_map(loaded, *volume, names=known, map_to_scene=to_scene, within_mm=within_mm)
+            new_scene = label_by_map(loaded, *volume, names=known, map_to_scene=to_scene, within_mm=within_mm)
         elif painted is not None:
             poses = painted.poses if link is None else link.probe_to_scene(painted.poses)
             pairs = [PaintedFrame(pose, labels) for pose, labels in zip(poses, painted.labels, strict=True)]
-            labelled = label_by_frames(loaded, pairs, names=known, within_mm=within_mm)
-    labelled.save(output)
-    of_each = np.bincount(np.zeros(0, int) if labelled.labels is None else labelled.labels.numpy(), minlength=256)
-    counts = {name: int(of_each[number]) for number, name in labelled.info.label_names.items()}
-    document = {"output": str(output), "gaussian_count": labelled.gaussian_count, "labelled": counts}
+            new_scene = label_by_frames(loaded, pairs, names=known, within_mm=within_mm)
+    new_scene.save(output)
+    of_each = np.bincount(np.zeros(0, int) if new_scene.labels is None else new_scene.labels.numpy(), minlength=256)
+    counts = {name: int(of_each[number]) for number, name in new_scene.info.label_names.items()}
+    document = {"output": str(output), "gaussian_count": new_scene.gaussian_count, "labelled": counts}
     words = ", ".join(f"{count:,} {name}" for name, count in counts.items())
-    tell(f"wrote {output}: of {labelled.gaussian_count:,} Gaussians {words}", document, as_json=json)
+    tell(f"wrote {output}: of {new_scene.gaussian_count:,} Gaussians {words}", document, as_json=json)

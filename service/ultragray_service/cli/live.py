@@ -77,17 +77,17 @@ def live(
         "image_width": first.width,
     }
     suffix = "?private=true" if private else ""
-    begun = connection.json("PUT", route("recordings", name, suffix=suffix), settings)
+    recording = connection.json("PUT", route("recordings", name, suffix=suffix), settings)
     job: dict[str, Any] | None = None
     if scene is not None:
-        asked = {"kind": "live", "specification": {"recording": name, "scene": scene}, "private": private}
-        job = connection.json("POST", "/v1/jobs", asked)
+        submission = {"kind": "live", "specification": {"recording": name, "scene": scene}, "private": private}
+        job = connection.json("POST", "/v1/jobs", submission)
     ends = (KeyboardInterrupt,) if is_scanner else ()
     with counted(f"recording {name}", total) as report, contextlib.suppress(*ends):
         for number, frame in enumerate(chain([first], frames)):
             head: dict[str, Any] = {
                 "pose": {"matrix": frame.poses[0].tolist()},
-                "number": begun["next_number"] + number,
+                "number": recording["next_number"] + number,
             }
             if frame.times_s is not None:
                 head["time_s"] = float(frame.times_s[0])
@@ -99,9 +99,9 @@ def live(
         tell(f"{name} is open, with {state['frames']:,} frames", {"recording": state, "job": job}, as_json=json)
         return
     record = connection.json("POST", route("recordings", name, suffix=":finish"), timeout_s=CHECK_TIMEOUT_S)
-    told = f"{record['train_frames']} training and {record['val_frames']} held-out frames"
+    counts = f"{record['train_frames']} training and {record['val_frames']} held-out frames"
     job_id = "" if job is None else f"; the job {job['id']} ends its scene"
-    tell(f"recorded {name}: {told}{job_id}", {"dataset": record, "job": job}, as_json=json)
+    tell(f"recorded {name}: {counts}{job_id}", {"dataset": record, "job": job}, as_json=json)
     if wait and job is not None:
         follow(connection, job["id"])
 

@@ -56,17 +56,17 @@ def motion(
     force: Force = False,
     json: Json = False,
     *,
-    asked: MotionSettings,
+    settings: MotionSettings,
 ) -> None:
     """One mode more: learned from a sweep, of a field, or built in. `phase` has a number for each, in their order."""
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)
     read_header(scene)
-    asked.check_source(sweep=sweep is not None, field=field is not None)
+    settings.check_source(sweep=sweep is not None, field=field is not None)
     if (sweep is None) != (surrogate is None):
         raise InvalidArgument("--sweep and --surrogate belong together", field="surrogate")
-    asked.check_field(is_given=field is not None)
+    settings.check_field(is_given=field is not None)
     link = None if registration is None else load_registration(registration)
-    voxels = None if field is None else read_vector_field(field, asked.field_axes)
+    voxels = None if field is None else read_vector_field(field, settings.field_axes)
 
     from ultragray import GaussianScene
     from ultragray.datasets.source import load_dataset
@@ -80,11 +80,11 @@ def motion(
         train = sources["sweep"] = load_dataset(sweep).train
         if numbers is not None:
             sources |= {"numbers": numbers_of(train, numbers, surrogate), "surrogate": Path(surrogate).name}
-    if voxels is not None and asked.field_leads is not None:
+    if voxels is not None and settings.field_leads is not None:
         to_scene = None if link is None else np.asarray(link.base_to_scene)
-        sources["field"] = field_of_voxels(voxels, loaded.info, asked.field_leads, to_scene)
-    with counted("learning motion", asked.steps if sweep else 1) as count_done:
-        added = add_motion(loaded, asked, **sources, report=lambda done, _: count_done(done))
+        sources["field"] = field_of_voxels(voxels, loaded.info, settings.field_leads, to_scene)
+    with counted("learning motion", settings.steps if sweep else 1) as count_done:
+        added = add_motion(loaded, settings, **sources, report=lambda done, _: count_done(done))
     added.scene.save(output)
     facts = added.facts()
     mode, residual = facts["modes"][-1], facts["residual_mm"]

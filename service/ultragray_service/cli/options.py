@@ -65,9 +65,9 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
     own, parameters = parameters_in(command), list[inspect.Parameter]()
     for parameter in own:
         name, (cls, _) = parameter.name, optional_of(parameter.annotation)
-        if isinstance(asked := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
-            contracts[name] = asked
-            parameters += _chosen_parameters(asked)
+        if isinstance(fields := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
+            contracts[name] = fields
+            parameters += _chosen_parameters(fields)
         elif isinstance(cls, type) and issubclass(cls, Contract):
             contracts[name] = cls
             parameters += parameters_of(cls, name)
@@ -75,17 +75,17 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
             parameters.append(parameter)
 
     @wraps(command)
-    def run(**given: Any) -> Any:
-        made = {name: _made(cls, name, given) for name, cls in contracts.items()}
-        return command(**{one.name: made[one.name] if one.name in made else given[one.name] for one in own})
+    def run(**inputs: Any) -> Any:
+        objects = {name: _object_of(cls, name, inputs) for name, cls in contracts.items()}
+        return command(**{one.name: objects[one.name] if one.name in objects else inputs[one.name] for one in own})
 
     return with_parameters(run, parameters)
 
 
-def _made(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
+def _object_of(cls: Any, name: str, inputs: Mapping[str, Any]) -> Any:
     if isinstance(cls, FieldsOf):
-        return values_of(cls.cls, defaultdict(lambda: None, given))
-    return _part(cls, name, given) if issubclass(cls, Family) else cls(**values_of(cls, given))
+        return values_of(cls.cls, defaultdict(lambda: None, inputs))
+    return _part(cls, name, inputs) if issubclass(cls, Family) else cls(**values_of(cls, inputs))
 
 
 def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parameter]) -> Callable[..., Any]:
@@ -96,8 +96,8 @@ def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parame
 
 def parameters_in(function: Callable[..., Any]) -> list[inspect.Parameter]:
     hints = get_type_hints(function, include_extras=True)
-    found = inspect.signature(function).parameters.items()
-    return [one.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY) for name, one in found]
+    parameters = inspect.signature(function).parameters.items()
+    return [one.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY) for name, one in parameters]
 
 
 def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
@@ -105,43 +105,43 @@ def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
     if issubclass(cls, _WITH_AN_OPTION_A_FIELD):
         return [*_family_parameters(cls, name)]
     argument = next((item for item, _ in _fields(cls) if _is_required(item)), None)
-    found: list[inspect.Parameter] = []
+    parameters: list[inspect.Parameter] = []
     for item, kind in _fields(cls):
         if _is_within(kind):
-            found += parameters_of(kind, item.name)
+            parameters += parameters_of(kind, item.name)
         elif item is argument:
-            found.insert(0, _parameter(item, kind, topic=None, is_argument=True))
+            parameters.insert(0, _parameter(item, kind, topic=None, is_argument=True))
         else:
             varies = " LOW:HIGH: drawn at random for each frame." if _may_vary(cls, item) else ""
-            found.append(_parameter(item, str if varies else kind, topic=cls.__topic__, more=varies))
-    return found
+            parameters.append(_parameter(item, str if varies else kind, topic=cls.__topic__, more=varies))
+    return parameters
 
 
-def _chosen_parameters(asked: FieldsOf) -> Iterator[inspect.Parameter]:
-    for parameter in parameters_of(asked.cls):
-        if parameter.name in asked.names:
-            if asked.environment is not None:
+def _chosen_parameters(fields: FieldsOf) -> Iterator[inspect.Parameter]:
+    for parameter in parameters_of(fields.cls):
+        if parameter.name in fields.names:
+            if fields.environment is not None:
                 option = parameter.annotation.__metadata__[0]
-                option.help += f" [{asked.environment}{parameter.name.upper()}]"
+                option.help += f" [{fields.environment}{parameter.name.upper()}]"
             yield parameter
 
 
-def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def values_of(cls: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
     """The fields that options gave, as Python has them. Raises InvalidArgument, naming the option."""
-    found = {}
+    values = {}
     for item, kind in _fields(cls):
         if kind is bool:
-            value = (not item.default) if given[item.name] else None
+            value = (not item.default) if inputs[item.name] else None
         elif _is_within(kind):
-            value = _part(kind, item.name, given)
-        elif _may_vary(cls, item) and ":" in (given[item.name] or ""):
-            found[item.name + _BETWEEN] = from_text(given[item.name].replace(":", ","), tuple[float, ...])
+            value = _part(kind, item.name, inputs)
+        elif _may_vary(cls, item) and ":" in (inputs[item.name] or ""):
+            values[item.name + _BETWEEN] = from_text(inputs[item.name].replace(":", ","), tuple[float, ...])
             continue
         else:
-            value = None if given[item.name] is None else _read(given[item.name], kind, item.name)
+            value = None if inputs[item.name] is None else _read(inputs[item.name], kind, item.name)
         if value is not None:
-            found[item.name] = value
-    return found
+            values[item.name] = value
+    return values
 
 
 def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
@@ -164,8 +164,8 @@ def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
     option = typer.Option(_flag(name), help=help, show_default=False, rich_help_panel=family.__topic__)
     yield keyword(name, Annotated[str | None, option], None)
     members = {kind: {item.name: (item, of) for item, of in _fields(cls)} for kind, cls in family.members.items()}
-    for option in dict.fromkeys(option for taken in members.values() for option in taken):
-        takers = [kind for kind, taken in members.items() if option in taken]
+    for option in dict.fromkeys(option for fields in members.values() for option in fields):
+        takers = [kind for kind, fields in members.items() if option in fields]
         item, kind = members[takers[0]][option]
         yield _parameter(item, kind, topic=family.__topic__, takers=takers)
 
@@ -194,18 +194,18 @@ def _parameter(
         meaning += f" One of {', '.join(choices)}."
     meaning += more
     if isinstance(kind, type) and issubclass(kind, Family):
-        named = f" One of {', '.join(kind.named)}, or as" if kind.named else " As"
-        meaning += f"{named} JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
+        presets = f" One of {', '.join(kind.named)}, or as" if kind.named else " As"
+        meaning += f"{presets} JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
     is_file = item.name in _FILES or (isinstance(kind, type) and issubclass(kind, OfFile))
     parsed: Any = list[str] if is_table else Path if is_file else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
-    shown = not is_switch and _shown_default(item)
+    show_default = not is_switch and _shown_default(item)
     option = typer.Option(
         *flags,
         help=meaning,
         metavar="NAME=VALUE" if is_table else None,
-        show_default=shown,
+        show_default=show_default,
         rich_help_panel=item.metadata.get("topic", topic),
     )
     if is_switch:
@@ -246,26 +246,26 @@ def _shown_default(item: Field[Any]) -> str | bool:
     return False if default in (None, MISSING, "") else str(default)
 
 
-def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
+def _part(cls: Any, name: str, inputs: Mapping[str, Any]) -> Any:
     """The object that the options of a part or of a sampler give; None where none of them was given."""
     if not issubclass(cls, Family):
-        values = values_of(cls, given)
+        values = values_of(cls, inputs)
         return cls(**values) if values else None
     options = dict.fromkeys(item.name for member in cls.members.values() for item, _ in _fields(member))
-    document = {option: given[option] for option in options if given[option] is not None}
-    if given[name] is not None:
-        if (member := cls.members.get(given[name])) is None:
+    document = {option: inputs[option] for option in options if inputs[option] is not None}
+    if inputs[name] is not None:
+        if (member := cls.members.get(inputs[name])) is None:
             raise InvalidArgument(
-                f"{_flag(name)} must be one of {', '.join(cls.members)}, got {given[name]!r}", field=name
+                f"{_flag(name)} must be one of {', '.join(cls.members)}, got {inputs[name]!r}", field=name
             )
-        taken = {item.name: item for item, _ in _fields(member)}
-        for option, item in taken.items():
+        fields = {item.name: item for item, _ in _fields(member)}
+        for option, item in fields.items():
             if _is_required(item) and option not in document:
-                raise InvalidArgument(f"{_flag(name)} {given[name]} needs {_flag(option)}", field=option)
+                raise InvalidArgument(f"{_flag(name)} {inputs[name]} needs {_flag(option)}", field=option)
         for option in document:
-            if option not in taken:
-                raise InvalidArgument(f"{_flag(name)} {given[name]} takes no {_flag(option)}", field=option)
-        return from_dict(cls, {"kind": given[name], **document})
+            if option not in fields:
+                raise InvalidArgument(f"{_flag(name)} {inputs[name]} takes no {_flag(option)}", field=option)
+        return from_dict(cls, {"kind": inputs[name], **document})
     for option in document:
         raise InvalidArgument(f"{_flag(option)} is of a {name}: name it with {_flag(name)}", field=option)
     return None
@@ -302,13 +302,13 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 
 def pairs_of(texts: list[str], flag: str) -> dict[str, str]:
-    found = {}
+    pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
             raise InvalidArgument(f"{flag} takes NAME=VALUE, got {text!r}", field=flag.removeprefix("--"))
-        found[name.strip()] = value.strip()
-    return found
+        pairs[name.strip()] = value.strip()
+    return pairs
 
 
 def _flag(name: str) -> str:

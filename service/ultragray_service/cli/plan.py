@@ -53,16 +53,16 @@ def plan(
     if output is not None:
         check_file(output, POSE_SUFFIXES, force=force)
     read_header(scene)
-    listed, standard, begin = (None if one is None else load_poses(one) for one in (poses, view, start))
+    reach, standard, begin = (None if one is None else load_poses(one) for one in (poses, view, start))
 
     from ultragray import GaussianScene, plan_views
 
     with working("planning …"):
-        found = plan_views(GaussianScene.load(scene), settings, poses=listed, view=standard, start=begin)
-    if output is not None and len(found.poses):
-        write_whole(output, npy_bytes(found.poses))
-    tell(_in_words(found, settings), {name: _plain(one) for name, one in asdict(found).items()}, as_json=json)
-    if not len(found.poses):
+        view_plan = plan_views(GaussianScene.load(scene), settings, poses=reach, view=standard, start=begin)
+    if output is not None and len(view_plan.poses):
+        write_whole(output, npy_bytes(view_plan.poses))
+    tell(_in_words(view_plan, settings), {name: _plain(one) for name, one in asdict(view_plan).items()}, as_json=json)
+    if not len(view_plan.poses):
         raise typer.Exit(1)
 
 
@@ -70,13 +70,13 @@ def _plain(value: FloatArray | float) -> object:
     return value if isinstance(value, float) else value.tolist()
 
 
-def _in_words(found: ViewPlan, asked: PlanSettings) -> str:
-    if not len(found.poses):
-        way = "" if asked.path_mm is None else f" on a way of {asked.path_mm:g} mm"
-        return f"no pose in reach{way} adds to the {asked.want} of {found.before:.3f}"
+def _in_words(outcome: ViewPlan, settings: PlanSettings) -> str:
+    if not len(outcome.poses):
+        way = "" if settings.path_mm is None else f" on a way of {settings.path_mm:g} mm"
+        return f"no pose in reach{way} adds to the {settings.want} of {outcome.before:.3f}"
     rows = [
         f"{'  '.join(f'{value:8.2f}' for value in pose[:3, 3])}   {gain:+.4f}"
-        for pose, gain in zip(found.poses, found.gains, strict=True)
+        for pose, gain in zip(outcome.poses, outcome.gains, strict=True)
     ]
-    head = f"{len(rows)} views, {found.path_mm:.0f} mm: {asked.want} {found.before:.3f} → {found.after:.3f}"
+    head = f"{len(rows)} views, {outcome.path_mm:.0f} mm: {settings.want} {outcome.before:.3f} → {outcome.after:.3f}"
     return "\n".join([head, "       x         y         z mm   gain", *rows])

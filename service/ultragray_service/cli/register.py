@@ -79,31 +79,31 @@ def localize(
 
     with working("looking for the frame …"):
         loaded = GaussianScene.load(scene)
-        found = sought(
+        match = sought(
             loaded, pixels, about, within_mm=within_mm, within_deg=within_deg, search=search, backend=backend
         )
-    if output is not None and found.is_found:
-        write_whole(output, npy_bytes(found.pose))
-    document = asdict(found) | {"pose": found.pose.tolist()}
-    tell(_in_words(found, output), document, as_json=json)
-    if not found.is_found:
+    if output is not None and match.is_found:
+        write_whole(output, npy_bytes(match.pose))
+    document = asdict(match) | {"pose": match.pose.tolist()}
+    tell(_in_words(match, output), document, as_json=json)
+    if not match.is_found:
         raise typer.Exit(1)
 
 
-def _in_words(found: Localization, output: Path | None) -> str:
+def _in_words(match: Localization, output: Path | None) -> str:
     from ultragray.learn.localization.search import FOUND_SIMILARITY
 
-    if not found.is_found:
+    if not match.is_found:
         return (
-            f"not found: the place that looks most like it has a similarity of {found.similarity:.2f}, where "
+            f"not found: the place that looks most like it has a similarity of {match.similarity:.2f}, where "
             f"{FOUND_SIMILARITY} is needed; a start that is closer, or a larger --within-mm, may help"
         )
-    position = ", ".join(f"{one:.2g}" for one in found.position_std_mm)
-    angle = ", ".join(f"{one:.2g}" for one in found.angle_std_deg)
-    rows = "\n".join("  " + "  ".join(f"{value:10.4f}" for value in row) for row in found.pose)
+    position = ", ".join(f"{one:.2g}" for one in match.position_std_mm)
+    angle = ", ".join(f"{one:.2g}" for one in match.angle_std_deg)
+    rows = "\n".join("  " + "  ".join(f"{value:10.4f}" for value in row) for row in match.pose)
     where = "" if output is None else f"\nwrote {output}"
     return (
-        f"found with a similarity of {found.similarity:.2f}, {found.shift_mm:.2f} mm and {found.turn_deg:.2f}° from "
+        f"found with a similarity of {match.similarity:.2f}, {match.shift_mm:.2f} mm and {match.turn_deg:.2f}° from "
         f"the start; standard deviations along and about the probe's axes: {position} mm, {angle}°\n{rows}{where}"
     )
 
@@ -219,7 +219,7 @@ def frames(
     from ultragray.learn.registration import register_frames
 
     with working("looking for the frames …"):
-        found = register_frames(
+        registration = register_frames(
             GaussianScene.load(scene),
             pixels,
             in_base,
@@ -229,9 +229,9 @@ def frames(
             within_deg=within_deg,
             backend=backend,
         )
-    left_out = sorted({*range(len(pixels))} - {*found.agreeing})
-    residuals = found.fit.residuals_mm.tolist(), found.fit.residuals_deg.tolist()
-    _write(output, _registration(found.fit), "frames", *residuals, left_out=left_out, as_json=json)
+    left_out = sorted({*range(len(pixels))} - {*registration.agreeing})
+    residuals = registration.fit.residuals_mm.tolist(), registration.fit.residuals_deg.tolist()
+    _write(output, _registration(registration.fit), "frames", *residuals, left_out=left_out, as_json=json)
 
 
 def _registration(fit: Any) -> Registration:
@@ -263,8 +263,8 @@ def _read_points(path: Path) -> Any:
 def _read_frames(paths: list[Path]) -> list[Any]:
     from ultragray.learn.localization.pixels import read_frame
 
-    read = [read_frame(path) for path in paths]
-    return list(read[0]) if len(read) == 1 and read[0].ndim == 3 else read
+    frames = [read_frame(path) for path in paths]
+    return list(frames[0]) if len(frames) == 1 and frames[0].ndim == 3 else frames
 
 
 def _mounting(path: Path | None) -> FloatArray | None:
@@ -272,10 +272,10 @@ def _mounting(path: Path | None) -> FloatArray | None:
 
 
 def _one_pose(path: Path, field: str) -> FloatArray:
-    found = load_poses(path)
-    if len(found) != 1:
-        raise InvalidArgument(f"{path} must hold one pose, got {len(found)}", field=field)
-    pose: FloatArray = found[0]
+    poses = load_poses(path)
+    if len(poses) != 1:
+        raise InvalidArgument(f"{path} must hold one pose, got {len(poses)}", field=field)
+    pose: FloatArray = poses[0]
     return pose
 
 

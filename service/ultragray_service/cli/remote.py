@@ -90,8 +90,8 @@ def _poses(
     if sampler is None and base is not None:
         return base
     if base is None:  # at most 10,000 training poses
-        found = connection.json("GET", route("scenes", scene, "training-poses"))
-        base = check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
+        answer = connection.json("GET", route("scenes", scene, "training-poses"))
+        base = check_poses(np.array(answer["poses"], np.float64).reshape(-1, 4, 4))
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
     if sampler is None:
@@ -140,24 +140,24 @@ def _time(text: str | None) -> str:
     return (text or "")[:19].replace("T", " ")
 
 
-def _owner(found: dict[str, Any]) -> str:
-    return f"{found.get('owner') or ''}{' (private)' if found.get('private') else ''}"
+def _owner(item: dict[str, Any]) -> str:
+    return f"{item.get('owner') or ''}{' (private)' if item.get('private') else ''}"
 
 
 def _text_of(key: str) -> Callable[[dict[str, Any]], str]:
-    return lambda found: str(found[key] or "")
+    return lambda item: str(item[key] or "")
 
 
 def _number_of(key: str, layout: str, unit: float | None = None) -> Callable[[dict[str, Any]], str]:
-    def shown(found: dict[str, Any]) -> str:
-        value = found.get(key)
+    def text(item: dict[str, Any]) -> str:
+        value = item.get(key)
         return "" if value is None else format(value if unit is None else value / unit, layout)
 
-    return shown
+    return text
 
 
-def _size(found: dict[str, Any]) -> str:
-    return "" if found.get("image_height") is None else f"{found['image_width']}x{found['image_height']}"
+def _size(item: dict[str, Any]) -> str:
+    return "" if item.get("image_height") is None else f"{item['image_width']}x{item['image_height']}"
 
 
 NameArgument = Annotated[str, argument("Name of the scene.", metavar="NAME")]
@@ -253,18 +253,18 @@ def label_scene(
 ) -> None:
     """Have the service label the Gaussians of a scene, as another scene."""
     check_source(label_map, frames)
-    asked = {"into": into, "replace": replace, "private": private, "within_mm": within_mm, "registration": registration}
-    asked["label_names"] = parse_names(names)
+    body = {"into": into, "replace": replace, "private": private, "within_mm": within_mm, "registration": registration}
+    body["label_names"] = parse_names(names)
     if label_map is not None:
         read_label_map(label_map)  # what is none is refused before it travels
-        suffix, asked["label_map"] = ":label-by-map", _base64(label_map.read_bytes())
+        suffix, body["label_map"] = ":label-by-map", _base64(label_map.read_bytes())
     elif frames is not None:
         painted, suffix = read_painted(frames), ":label"
-        asked["frames"] = [
+        body["frames"] = [
             {"pose": _pose(pose), "labels": _base64(png_file(labels))}
             for pose, labels in zip(painted.poses, painted.labels, strict=True)
         ]
-    scene = connection.json("POST", route("scenes", name, suffix=suffix), asked)
+    scene = connection.json("POST", route("scenes", name, suffix=suffix), body)
     tell(f"labelled {name} as {into}: {', '.join(scene['label_names'].values())}", scene, as_json=json)
 
 
@@ -315,10 +315,10 @@ def make_scene(
     recipe: Annotated[dict[str, Any], RECIPE_FIELDS],
 ) -> None:
     """Have the service make a scene that nobody recorded, from a label map or meshes."""
-    asked = to_dict(read_recipe(tissue, labels, ct, **recipe), with_none=False)
-    scene = connection.json("POST", route("scenes", suffix=":from-labels"), {**asked, "into": into, "private": private})
-    made = ", ".join(scene["made_labels"])
-    tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, {made}", scene, as_json=json)
+    body = to_dict(read_recipe(tissue, labels, ct, **recipe), with_none=False)
+    scene = connection.json("POST", route("scenes", suffix=":from-labels"), {**body, "into": into, "private": private})
+    label_names = ", ".join(scene["made_labels"])
+    tell(f"made {into}: {scene['gaussian_count']:,} Gaussians, {label_names}", scene, as_json=json)
 
 
 def _base64(data: bytes) -> str:
@@ -360,22 +360,22 @@ def render_scene(
             field="registration",
         )
     chosen = _poses(connection, name, None if poses is None else load_poses(poses), sampler, settings.probe)
-    asked = {**to_dict(settings, with_none=False), "outputs": list(settings.outputs)}
+    body = {**to_dict(settings, with_none=False), "outputs": list(settings.outputs)}
     if registration is not None:
-        asked["registration"] = registration
+        body["registration"] = registration
     if suffix is None:
-        shape = _write_folder(connection, name, output, asked, chosen)
+        shape = _write_folder(connection, name, output, body, chosen)
     elif suffix != ".npz" and len(chosen) != 1:
         raise InvalidArgument(
             f"a picture holds one frame, there are {len(chosen)} poses: write a .npz file or a folder", field="output"
         )
     else:
         of_many = {"pose": _pose(chosen[0])} if len(chosen) == 1 else {"poses": list(map(_pose, chosen))}
-        data, headers = _rendered(connection, name, {**asked, **of_many}, MEDIA_TYPES[suffix])
+        data, headers = _rendered(connection, name, {**body, **of_many}, MEDIA_TYPES[suffix])
         write_whole(output, data)
         shape = headers["x-ultragray-shape"]
     _, _, height, width = map(int, shape.split(","))
-    facts = {"frames": len(chosen), "height": height, "width": width, "outputs": asked["outputs"]}
+    facts = {"frames": len(chosen), "height": height, "width": width, "outputs": body["outputs"]}
     what = f"{frames_in_words(len(chosen))} of {height}x{width}, {', '.join(settings.outputs)}"
     tell(f"wrote {output}: {what}", {"output": str(output), "scene": name, **facts}, as_json=json)
 
@@ -438,8 +438,8 @@ _datasets.add_delete("Delete a dataset that no job needs.")
 
 
 def _name_of(sweep: Path) -> str:
-    found = sweep.resolve()
-    name = (found.parent if _is_of_a_folder(found) else found).name.split(".")[0]
+    path = sweep.resolve()
+    name = (path.parent if _is_of_a_folder(path) else path).name.split(".")[0]
     if not name:
         raise InvalidArgument(f"--name must be given: {sweep} has none", field="name")
     return name
@@ -460,11 +460,11 @@ def archive_of(source: Path, companions: Mapping[str, Path] | None = None) -> It
     files = [*_files_of(source), *(companions or {}).values()]
     with tempfile.TemporaryDirectory(prefix="ultragray-upload-") as folder:
         archive = Path(folder, "upload.zip")
-        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as made:
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as zip_file:
             for path in files:
                 below = source if source.is_dir() else source.parent
                 inner = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
-                made.write(path, inner.as_posix())
+                zip_file.write(path, inner.as_posix())
         yield archive
 
 
@@ -517,7 +517,7 @@ _registrations = Resource(
         "name": _text_of("name"),
         "scene": _text_of("scene"),
         "residual mm": _number_of("residual_mm", ".2g"),
-        "changed": lambda found: _time(found["changed_at"]),
+        "changed": lambda item: _time(item["changed_at"]),
         "owner": _text_of("owner"),
     },
 )
@@ -545,8 +545,8 @@ def upload_registration(
 
     called = file.stem if name is None else name
     content = {"scene": scene, **to_dict(load_registration(file), with_none=False)}
-    kept = connection.json("PUT", route("registrations", called), content)
-    tell(f"uploaded {called}, of the scene {kept['scene']}", kept, as_json=json)
+    registration = connection.json("PUT", route("registrations", called), content)
+    tell(f"uploaded {called}, of the scene {registration['scene']}", registration, as_json=json)
 
 
 _registrations.add_delete("Forget a registration. Jobs that were accepted with it keep it.")

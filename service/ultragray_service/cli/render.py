@@ -145,7 +145,7 @@ def render_frames(
     scene_file: Path,
     pose_file: Path | None,
     sampler: Sampler | None,
-    asked: FrameSettings,
+    request: FrameSettings,
     output: Path,
     *,
     format: str | None,
@@ -157,7 +157,7 @@ def render_frames(
     given_poses = None if pose_file is None else load_poses(pose_file)
     header = read_header(scene_file)
     with _probe_as_an_option():
-        settings = asked.resolved(header.info, Encoding.FLOAT32)
+        settings = request.resolved(header.info, Encoding.FLOAT32)
     base = header.training_poses if given_poses is None else given_poses
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
@@ -183,7 +183,7 @@ def render_frames(
         seen = assess_by_rendering(scene, settings, assess, backend=backend)
         poses, extrapolations = assessed_poses(sampler, base, settings.probe, seen, settings.least_confidence)
     with counted("rendering", len(poses)) as report:
-        found, _ = render_to_file(
+        assessments, _ = render_to_file(
             output,
             format,
             scene,
@@ -197,14 +197,14 @@ def render_frames(
             before_portion=report,
         )
     seconds = time.perf_counter() - started
-    figures = figure_arrays(found)
+    figures = figure_arrays(assessments)
     confidence, supported = figures["confidence"], float(figures["supported_share"].mean())
     knows = bool(np.isfinite(confidence).all())  # its confidence
     trust = [f"confidence {confidence.min():.2f} to {confidence.max():.2f}"] if knows else []
     trust.append(f"Gaussians support {supported:.0%} of the pixels")
     document = {
         "output": str(output),
-        "frames": len(found),
+        "frames": len(assessments),
         "height": settings.height,
         "width": settings.width,
         "outputs": list(settings.outputs),
@@ -218,7 +218,7 @@ def render_frames(
         trust.append(f"{document['contact_share']:.0%} of the scan lines have contact")
     if "force_n" in document:
         trust.append(f"pressed in by {document['indentation_mm']:.1f} mm with {document['force_n']:.1f} N")
-    what = f"{frames_in_words(len(found))} of {settings.height}x{settings.width}, {', '.join(settings.outputs)}"
+    what = f"{frames_in_words(len(assessments))} of {settings.height}x{settings.width}, {', '.join(settings.outputs)}"
     return f"wrote {output}: {what}, in {seconds:.1f} s; {', '.join(trust)}", document
 
 

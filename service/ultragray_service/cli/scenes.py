@@ -249,8 +249,8 @@ def import_scene(
         "--image-height": image_height is not None,
     }
     if file.suffix == ".ply":
-        if given := [name for name, is_given in of_checkpoint.items() if is_given]:
-            raise InvalidArgument(f"{given[0]} is for checkpoints (.pt), {file.name} is a PLY file", field="file")
+        if options := [name for name, is_given in of_checkpoint.items() if is_given]:
+            raise InvalidArgument(f"{options[0]} is for checkpoints (.pt), {file.name} is a PLY file", field="file")
     elif config is None:
         raise InvalidArgument("--config must be given: the conf.json of the checkpoint's dataset", field="config")
     elif [poses is not None, center is not None, centered].count(True) != 1:

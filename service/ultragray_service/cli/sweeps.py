@@ -101,9 +101,9 @@ def _print_report(report: DatasetReport) -> None:
     table.add_column()
     for name in ("train", "val")[: len(parts)]:
         table.add_column(name, justify="right")
-    described = [_describe(part) for part in parts]
-    for label in described[0]:
-        table.add_row(label, *(column[label] for column in described))
+    columns = [_describe(part) for part in parts]
+    for label in columns[0]:
+        table.add_row(label, *(column[label] for column in columns))
     console = Console()
     console.print(f"{escape(report.name)}: {report.probe}", soft_wrap=True, highlight=False)
     console.print(table)
@@ -191,26 +191,26 @@ def convert(
     check_folder(output, force=force)
     if poses_of is not None:
         read_header(poses_of)
-    read = read_dataset(sweep, source)
+    dataset = read_dataset(sweep, source)
     if poses_of is not None:
-        read = _with_poses_of(poses_of, read)
+        dataset = _with_poses_of(poses_of, dataset)
     marks = 0
     if anonymize:
         from ultragray.datasets.checks import without_names
 
-        read, marks = without_names(read)
-    write_released(read, output, replace=force)
+        dataset, marks = without_names(dataset)
+    write_released(dataset, output, replace=force)
     tell(
-        f"wrote {output}: {len(read.train)} training and {len(read.val)} held-out frames of "
-        f"{read.train.width}x{read.train.height}, {read.probe}"
+        f"wrote {output}: {len(dataset.train)} training and {len(dataset.val)} held-out frames of "
+        f"{dataset.train.width}x{dataset.train.height}, {dataset.probe}"
         + (f"; {marks} marks in the pixels are black now: look at them" if anonymize else ""),
         {
             "output": str(output),
-            "sha256": read.sha256,
-            "training_frames": len(read.train),
-            "held_out_frames": len(read.val),
-            "image_height": read.train.height,
-            "image_width": read.train.width,
+            "sha256": dataset.sha256,
+            "training_frames": len(dataset.train),
+            "held_out_frames": len(dataset.val),
+            "image_height": dataset.train.height,
+            "image_width": dataset.train.width,
             **({"blackened_marks": marks} if anonymize else {}),
         },
         as_json=json,

@@ -45,12 +45,12 @@ def command_group(help: str | None = None) -> typer.Typer:
 def single(*lines: str, name: str | None = None) -> Callable[[Callable[..., Any]], typer.Typer]:
     """A decorator that makes an app of one command, with these examples, of a function."""
 
-    def made(command: Callable[..., Any]) -> typer.Typer:
+    def app_of(command: Callable[..., Any]) -> typer.Typer:
         app = command_group()
         app.command(name, epilog=examples(*lines))(command)
         return app
 
-    return made
+    return app_of
 
 
 def examples(*lines: str) -> str:
@@ -68,8 +68,8 @@ def argument(help: str, **others: Any) -> Any:
 
 def output_option(help: str, *, default: str | None = None) -> Any:
     """`--output FILE`, `-o FILE`; `default`: the words for what happens without it."""
-    shown: Any = False if default is None else default
-    return typer.Option("--output", "-o", help=help, show_default=shown, rich_help_panel=OUTPUT)
+    show_default: Any = False if default is None else default
+    return typer.Option("--output", "-o", help=help, show_default=show_default, rich_help_panel=OUTPUT)
 
 
 def tell(sentence: str, document: Any, *, as_json: bool) -> None:
@@ -117,7 +117,7 @@ def warn(text: str) -> None:
 
 
 SCENE_SUFFIX, COMPRESSED_SUFFIX = SUFFIXES
-_TOLD_EVERY_S = 10.0
+_REPORT_EVERY_S = 10.0
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 OR_A_FOLDER = ", or be a folder for PNGs (a name without an ending)"
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -158,10 +158,10 @@ def check_folder(path: Path, *, force: bool) -> None:
 def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") -> None:
     """Raise InvalidArgument where a name ends in none of `suffixes`; `otherwise`: what else it may be, in words."""
     if suffixes and not path.name.endswith(tuple(suffixes)):
-        given = path.suffix.lower()
-        similar = _SIMILAR.get(given)
-        near = [similar] if similar in suffixes else get_close_matches(given, suffixes, n=1, cutoff=0.7)
-        perhaps = f"; did you mean {near[0]}?" if near and len(suffixes) > 1 and given not in _PICTURES else ""
+        suffix = path.suffix.lower()
+        similar = _SIMILAR.get(suffix)
+        near = [similar] if similar in suffixes else get_close_matches(suffix, suffixes, n=1, cutoff=0.7)
+        perhaps = f"; did you mean {near[0]}?" if near and len(suffixes) > 1 and suffix not in _PICTURES else ""
         *others, last = suffixes
         expected = f"{', '.join(others)} or {last}" if others else last
         raise InvalidArgument(f"output must end in {expected}{otherwise}, got {path.name!r}{perhaps}", field="output")
@@ -238,8 +238,8 @@ def progress_bars(*columns: str) -> Iterator[Progress]:
         "left": rich_progress.TimeRemainingColumn,
     }
     console = Console(stderr=True)
-    made = (kinds[one]() if one in kinds else rich_progress.TextColumn(one, markup=False) for one in columns)
-    with rich_progress.Progress(*made, console=console, transient=True, disable=not console.is_terminal) as bars:
+    bar_columns = (kinds[one]() if one in kinds else rich_progress.TextColumn(one, markup=False) for one in columns)
+    with rich_progress.Progress(*bar_columns, console=console, transient=True, disable=not console.is_terminal) as bars:
         yield bars
 
 
@@ -248,14 +248,14 @@ def counted(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """A function that is told how many of `total` (None: unknown) are done: a bar on a terminal, elsewhere a line every
     10 s.
     """
-    started = told = time.monotonic()
+    started = last_report = time.monotonic()
 
     def tell_done(done: int) -> None:
-        nonlocal told
+        nonlocal last_report
         bars.update(task, completed=done)
         now = time.monotonic()
-        if bars.disable and done and now - told >= _TOLD_EVERY_S:
-            told = now
+        if bars.disable and done and now - last_report >= _REPORT_EVERY_S:
+            last_report = now
             minutes = 0.0 if total is None else (now - started) * (total - done) / done / 60.0
             of_all = "" if total is None else f" of {total:,}, {minutes:.1f} min left"
             typer.echo(f"{what}: {done:,}{of_all}", err=True)
@@ -312,11 +312,11 @@ def interrupted_by_sigterm() -> Iterator[None]:
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
     """A function that tells whether SIGINT or SIGTERM came; a process that is stopping ignores more of them."""
-    received: list[int] = []
+    signals: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]
+    before = [signal.signal(number, lambda came, frame: signals.append(came)) for number in numbers]
     try:
-        yield lambda: bool(received)
+        yield lambda: bool(signals)
     finally:
         for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, signal.SIG_IGN if received else handler)
+            signal.signal(number, signal.SIG_IGN if signals else handler)

@@ -87,7 +87,7 @@ def train(
     source: SourceOptions,
 ) -> None:
     """Ctrl-C leaves a usable scene, and --resume goes on. Frames are held out to measure the scene with."""
-    given = {
+    values = {
         **({} if config is None else read_config_file(config)),
         **parse_settings(setting or []),
         **settings,
@@ -113,7 +113,7 @@ def train(
             f"{run.folder}: there is an unfinished run: --resume continues it, --force begins anew"
         )
     check_file(output, [SCENE_SUFFIX], force=force or resume)
-    chosen = _config_of(run, given)
+    chosen = _config_of(run, values)
 
     from ultragray.learn.training.memory import training_device
 
@@ -122,11 +122,11 @@ def train(
         import torch
 
         torch.set_num_threads(threads)
-    read = read_dataset(sweep, source)
-    warn_about_dataset(read)
+    dataset = read_dataset(sweep, source)
+    warn_about_dataset(dataset)
     if not resume and run.checkpoint is not None:
         run.checkpoint.unlink()
-    _train(read, chosen, run, as_json=json)
+    _train(dataset, chosen, run, as_json=json)
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ def _check_resumable(run: RunOptions) -> None:
     raise TrainingStateInvalid(f"{run.folder}: no checkpoint to resume from; leave out --resume to begin a run")
 
 
-def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
+def _config_of(run: RunOptions, options: Mapping[str, Any]) -> TrainingConfig:
     """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
-    values = dict(given)
+    values = dict(options)
     preset = values.pop("preset", None)
     if run.resume and preset is None and run.checkpoint is not None:
         from ultragray.learn.training.checkpointing import read_checkpoint_header
@@ -274,8 +274,8 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
                     bar.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
                 return
             if state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                named = f"{state.beside}: " if state.beside else ""
-                sys.stderr.write(f"{named}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+                prefix = f"{state.beside}: " if state.beside else ""
+                sys.stderr.write(f"{prefix}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
             if is_last:
                 sys.stderr.write(f"{stage}: {MEASURING} …\n")
 

@@ -129,5 +129,5 @@ def _fitted(trips: deque[_RoundTrip]) -> _Line:
     inverse = np.linalg.inv(normal)
     offset_s, drift = inverse @ (weights * columns.T) @ (offsets_s - first_s)  # small numbers of large ones
     (variance, covariance), (_, drift_variance) = inverse
-    found = times_s[-1], first_s + offset_s, drift, least_s, variance, covariance, drift_variance
-    return _Line(*map(float, found))
+    values = times_s[-1], first_s + offset_s, drift, least_s, variance, covariance, drift_variance
+    return _Line(*map(float, values))

@@ -99,21 +99,21 @@ class SceneEdits:
         self._begin(target)
         scenes = {name: await self._path(name) for name in dict.fromkeys((scene, *scenes_named(target.edits)))}
 
-        async def edit(made: Path, replaced: Path | None) -> None:
-            arguments = {"output": str(made), "scenes": scenes, "edits": to_dict(target.edits)}
+        async def edit(output: Path, replaced: Path | None) -> None:
+            arguments = {"output": str(output), "scenes": scenes, "edits": to_dict(target.edits)}
             await _run(self._editing, edit_scene_file, arguments, "editing the scene")
 
-        return await self._made(target, edit)
+        return await self._new_scene(target, edit)
 
     async def make(self, target: RecipeTarget) -> Scene:
         """Raises SceneExists, LimitReached, QueueFull, and what `scene_from_labels` raises."""
         self._begin(target)
 
-        async def make(made: Path, replaced: Path | None) -> None:
-            arguments = {"output": str(made), "recipe": to_dict(made_of(SceneRecipe, target))}
+        async def make(output: Path, replaced: Path | None) -> None:
+            arguments = {"output": str(output), "recipe": to_dict(made_of(SceneRecipe, target))}
             await _run(self._editing, make_scene_file, arguments, "making the scene")
 
-        return await self._made(target, make)
+        return await self._new_scene(target, make)
 
     async def label_by_frames(
         self,
@@ -159,16 +159,16 @@ class SceneEdits:
             "within_mm": target.within_mm,
         }
 
-        async def label(made: Path, replaced: Path | None) -> None:
+        async def label(output: Path, replaced: Path | None) -> None:
             label_map = None
             if nifti is not None:
-                label_map = made.with_name("labels.nii.gz" if nifti.startswith(b"\x1f\x8b") else "labels.nii")
+                label_map = output.with_name("labels.nii.gz" if nifti.startswith(b"\x1f\x8b") else "labels.nii")
                 await asyncio.to_thread(label_map.write_bytes, nifti)
-            files = {"output": made, "replaced": replaced, "label_map": label_map}
+            files = {"output": output, "replaced": replaced, "label_map": label_map}
             paths = {name: None if path is None else str(path) for name, path in files.items()}
             await _run(self._labelling, label_scene, {**arguments, **paths}, "labelling the scene")
 
-        return await self._made(target, label, replace=target.replace)
+        return await self._new_scene(target, label, replace=target.replace)
 
     def _begin(self, target: Target) -> None:
         self._life.require_serving()
@@ -178,7 +178,7 @@ class SceneEdits:
         with scene_to_blame():
             return str(await asyncio.to_thread(self._store.path, scene))
 
-    async def _made(self, target: Target, make: Make, *, replace: bool = False) -> Scene:
+    async def _new_scene(self, target: Target, make: Make, *, replace: bool = False) -> Scene:
         header = await self._imports.make(target.into, make, replace=replace, private=target.private)
         return Scene.of(target.into, header, 0, self._owners.known(Kind.SCENE, target.into))
 

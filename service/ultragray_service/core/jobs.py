@@ -140,9 +140,9 @@ class JobWatch:
 
     def __init__(self, look: Callable[[], Awaitable[Looked]], log: GrowingLog, hub: JobHub) -> None:
         self._look, self._log, self._hub = look, log, hub
-        self._seen: Looked | None = None
-        self._told: Job | None = None
-        self.finished = False  # whether the final state was told
+        self._last_state: Looked | None = None
+        self._last_job: Job | None = None
+        self.finished = False  # whether the client has the final state
 
     async def next(self, timeout_s: float) -> JobChange | None:
         """The changes since the last call, after at most `timeout_s` seconds (none: an empty change).
@@ -153,14 +153,14 @@ class JobWatch:
         end = time.monotonic() + timeout_s
         while not self.finished and not self._hub.closing.is_set():
             try:
-                seen = await self._look()
+                state = await self._look()
             except (DatabaseUnavailable, StorageUnavailable):
-                if self._seen is None:
+                if self._last_state is None:
                     raise
-                seen = self._seen  # it comes back, and the watchers have nothing else to do
-            if self._log.has_more or seen != self._seen:
-                self._seen = seen
-                change = await self._change(seen[0])
+                state = self._last_state  # it comes back, and the watchers have nothing else to do
+            if self._log.has_more or state != self._last_state:
+                self._last_state = state
+                change = await self._change(state[0])
                 if change.job is not None or change.log:
                     return change
             if (left_s := end - time.monotonic()) <= 0:
@@ -172,9 +172,9 @@ class JobWatch:
     async def _change(self, job: Job) -> JobChange:
         # After the state was read, so that the log of a finished job is whole.
         lines = await self._hub.in_thread(self._log.read)
-        if job == self._told or (job.state.is_final and self._log.has_more):
+        if job == self._last_job or (job.state.is_final and self._log.has_more):
             return JobChange(None, lines, self._log.offset)
-        self._told, self.finished = job, job.state.is_final
+        self._last_job, self.finished = job, job.state.is_final
         return JobChange(job, lines, self._log.offset)
 
 

@@ -125,16 +125,16 @@ class StreamPreview:
             newest, agreed = self._newest, self._agreement
             if newest is None or self._previewer is None or result.settings.view != self._view:
                 return result, None
-            shown = await asyncio.to_thread(self._previewer.show, _grey(result), pose)
-        data = in_type(shown.frame, result.settings.encoding.pixel_type).tobytes()
+            preview_frame = await asyncio.to_thread(self._previewer.show, _grey(result), pose)
+        data = in_type(preview_frame.frame, result.settings.encoding.pixel_type).tobytes()
         confidence = result.extrapolations[0].confidence
         offset = result.poses[0] @ np.linalg.inv(pose)  # that it was rendered with: perhaps not the newest
         offset_mm, offset_deg = self._lengths(offset, newest)
-        told = Preview(
+        preview = Preview(
             real_age_ms=round(1e3 * (at_s - newest.measured_s), 3),
-            moved_mm=round(shown.moved_mm, 3),
-            is_real=shown.is_real,
-            expected_error=None if shown.expected_error is None else round(shown.expected_error, 4),
+            moved_mm=round(preview_frame.moved_mm, 3),
+            is_real=preview_frame.is_real,
+            expected_error=None if preview_frame.expected_error is None else round(preview_frame.expected_error, 4),
             agreement=round(agreed, 3),
             trust=None if confidence is None else round(confidence * max(agreed, 0.0), 3),
             offset_mm=round(offset_mm, 3),
@@ -142,7 +142,7 @@ class StreamPreview:
             disagrees=agreed < AGREES,
         )
         encode_ms = result.encode_ms + 1e3 * (time.perf_counter() - began)
-        return replace(result, data=data, encode_ms=encode_ms), told
+        return replace(result, data=data, encode_ms=encode_ms), preview
 
     async def close(self) -> None:
         """Ends what is under way."""
@@ -185,23 +185,23 @@ class StreamPreview:
         """Compares with the scene at an offset, which is believed where they agree by more than that."""
         known = self._offset
         rendered = await self._rendered(frame, offset)
-        found = await asyncio.to_thread(agreement, frame.grey, rendered)
-        if found <= more_than or self._offset is not known:
+        score = await asyncio.to_thread(agreement, frame.grey, rendered)
+        if score <= more_than or self._offset is not known:
             return
         view = frame.plan.settings.view
         async with self._turn:
             if self._previewer is None or view != self._view or offset is not known:
                 self._previewer, self._view = Previewer(frame.plan.settings.probe), view
             await asyncio.to_thread(self._previewer.observe, frame.grey, rendered, frame.pose)
-            self._offset, self._agreement, self._newest = offset, found, frame
+            self._offset, self._agreement, self._newest = offset, score, frame
 
     async def _search(self, frame: _Placed, agreed: float) -> None:
         self._searched_at_s = time.monotonic()
         try:
-            found = (await self._located(frame)).found
-            offset = found.pose @ np.linalg.inv(frame.pose)
+            match = (await self._located(frame)).found
+            offset = match.pose @ np.linalg.inv(frame.pose)
             moved_mm, turned_deg = self._lengths(offset, frame)
-            if found.is_found and moved_mm <= _MOST_MM and turned_deg <= _MOST_DEG:
+            if match.is_found and moved_mm <= _MOST_MM and turned_deg <= _MOST_DEG:
                 await self._take_in(frame, offset, more_than=agreed)
         except (UltragrayError, SceneChangedError):
             return

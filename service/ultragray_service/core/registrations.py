@@ -63,17 +63,17 @@ class Kept:
 def read_registration(engine: sa.Engine, name: str) -> Kept | None:
     with engine.connect() as connection:
         row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
-    return None if row is None else _kept(*row)
+    return None if row is None else _record_of(*row)
 
 
 def read_registrations(connection: sa.Connection) -> dict[str, Kept]:
-    found = {}
+    registrations = {}
     for row in connection.execute(sa.select(REGISTRATIONS)):
         try:
-            found[row.name] = _kept(*row)
+            registrations[row.name] = _record_of(*row)
         except (UltragrayError, ValueError) as error:
             _log.warning(f"the registration {row.name!r} cannot be read, and is left out: {error}")
-    return found
+    return registrations
 
 
 def write_registration(
@@ -102,18 +102,18 @@ def write_registration(
     with engine.begin() as connection:
         if most is not None:
             _require_room(connection, name, writer, most)
-        kept = (
+        statement = (
             insert(connection, REGISTRATIONS)
             .values(name=name, owner=writer.name, **values)
             .on_conflict_do_update(
                 index_elements=[_COLUMNS.name], set_={**values, "owner": owner}, where=_may_change(writer)
             )
         )
-        row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
+        row = connection.execute(statement.returning(*_COLUMNS)).one_or_none()
         if row is None:
             return None
         tell_change(connection)
-    return _kept(*row)
+    return _record_of(*row)
 
 
 def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
@@ -138,7 +138,7 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
 
 
 @lru_cache(maxsize=4096)  # they are read again whenever one of them, a key or an owner changes
-def _kept(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
+def _record_of(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
     facts: dict[str, Any] = {"name": name, "scene": scene, "owner": owner, "changed_at": iso_time(changed_at_s)}
     return Kept(NamedRegistration(**to_dict(from_dict(Registration, json.loads(document))), **facts), private_to)
 
@@ -178,8 +178,8 @@ class Registrations:
                     return
 
     async def get(self, name: str) -> NamedRegistration:
-        kept = await self._do(read_registration, name)
-        return await asyncio.to_thread(self._seen, name, kept)
+        record = await self._do(read_registration, name)
+        return await asyncio.to_thread(self._visible, name, record)
 
     async def ownership(self, name: str) -> Ownership:
         return Ownership((await self.get(name)).owner)
@@ -191,24 +191,24 @@ class Registrations:
         service may have changed it just now. Raises RegistrationNotFound, DatabaseUnavailable, and InvalidArgument for
         one of another scene.
         """
-        kept = self._copy.get(name)
+        record = self._copy.get(name)
         if (
-            kept is None
-            or kept.registration.scene != base_name(scene)
-            or not _is_seen(kept, lambda one: not self._owners.hides(Kind.SCENE, one))
+            record is None
+            or record.registration.scene != base_name(scene)
+            or not _is_seen(record, lambda one: not self._owners.hides(Kind.SCENE, one))
         ):
             return _of_scene(await self.get(name), scene)
-        return kept.registration
+        return record.registration
 
     def read_of_scene(self, name: str, scene: str) -> Registration:
-        """As `of_scene`, as it is kept now. Blocks; may be called from any thread."""
-        return _of_scene(self._seen(name, read_registration(self._opened, name)), scene)
+        """The registration that the database has now, else as `of_scene`. Blocks; may be called from any thread."""
+        return _of_scene(self._visible(name, read_registration(self._open_engine, name)), scene)
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
-        kept, there = await self._do(_read_all), set(await self._catalog.names())
-        seen = {name: one.registration for name, one in kept.items() if _is_seen(one, there.__contains__)}
-        names, next_page_token = page_of_names(sorted(seen), page_size, page_token)
-        return RegistrationPage([seen[name] for name in names], next_page_token)
+        records, there = await self._do(_read_all), set(await self._catalog.names())
+        registrations = {name: one.registration for name, one in records.items() if _is_seen(one, there.__contains__)}
+        names, next_page_token = page_of_names(sorted(registrations), page_size, page_token)
+        return RegistrationPage([registrations[name] for name in names], next_page_token)
 
     async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
         """Keeps a registration, in place of one of the name that is the caller's; else PermissionDenied is raised."""
@@ -224,11 +224,11 @@ class Registrations:
 
         def write(engine: sa.Engine) -> NamedRegistration:
             with self._writing:
-                kept = write_registration(engine, name, base_name(scene), private_to, registration, acting(), most)
-                if kept is None:
+                record = write_registration(engine, name, base_name(scene), private_to, registration, acting(), most)
+                if record is None:
                     raise _not_own(name)
-                self._change_copy(name, kept)
-            return kept.registration
+                self._change_copy(name, record)
+            return record.registration
 
         try:
             return await self._do(write)
@@ -245,28 +245,28 @@ class Registrations:
         await self.get(name)
         await self._do(forget)
 
-    def _change_copy(self, name: str, kept: Kept | None) -> None:
+    def _change_copy(self, name: str, record: Kept | None) -> None:
         with self._copying:
             self._changes += 1
-            if kept is None:
+            if record is None:
                 self._copy.pop(name, None)
             else:
-                self._copy[name] = kept
+                self._copy[name] = record
 
-    def _seen(self, name: str, kept: Kept | None) -> NamedRegistration:
-        """What was read of a name, where the caller may see it. Lists scenes: blocks. Raises RegistrationNotFound."""
-        if kept is None or not _is_seen(kept, lambda scene: scene in self._catalog.shown_names()):
+    def _visible(self, name: str, record: Kept | None) -> NamedRegistration:
+        """The registration of a record that the caller may see. Lists scenes: blocks. Raises RegistrationNotFound."""
+        if record is None or not _is_seen(record, lambda scene: scene in self._catalog.shown_names()):
             raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
-        return kept.registration
+        return record.registration
 
     @property
-    def _opened(self) -> sa.Engine:
+    def _open_engine(self) -> sa.Engine:
         assert self._engine is not None
         return self._engine
 
     async def _do(self, work: Callable[Concatenate[sa.Engine, P], T], *arguments: P.args, **options: P.kwargs) -> T:
         assert self._threads is not None
-        return await self._threads.ask(work, self._opened, *arguments, **options)
+        return await self._threads.ask(work, self._open_engine, *arguments, **options)
 
 
 def _read_all(engine: sa.Engine) -> dict[str, Kept]:
@@ -274,10 +274,10 @@ def _read_all(engine: sa.Engine) -> dict[str, Kept]:
         return read_registrations(connection)
 
 
-def _is_seen(kept: Kept, sees_scene: Callable[[str], bool]) -> bool:
-    if kept.private_to is not None:
-        return _is_own(kept.private_to)
-    return _is_own(kept.registration.owner) or sees_scene(kept.registration.scene)
+def _is_seen(record: Kept, sees_scene: Callable[[str], bool]) -> bool:
+    if record.private_to is not None:
+        return _is_own(record.private_to)
+    return _is_own(record.registration.owner) or sees_scene(record.registration.scene)
 
 
 def _is_own(owner: str | None) -> bool:
@@ -288,13 +288,13 @@ def _is_own(owner: str | None) -> bool:
         return True
 
 
-def _of_scene(found: NamedRegistration, scene: str) -> NamedRegistration:
-    if found.scene != base_name(scene):
+def _of_scene(link: NamedRegistration, scene: str) -> NamedRegistration:
+    if link.scene != base_name(scene):
         raise InvalidArgument(
-            f"registration must be one of the scene {base_name(scene)!r}: {found.name!r} is of {found.scene!r}",
+            f"registration must be one of the scene {base_name(scene)!r}: {link.name!r} is of {link.scene!r}",
             field="registration",
         )
-    return found
+    return link
 
 
 def _not_own(name: str) -> PermissionDenied:

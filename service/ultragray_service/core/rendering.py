@@ -121,16 +121,16 @@ class RequestPlanner:
         Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument,
         RegistrationNotFound, and what `complete` raises; `path` is the place of the settings in the client's message.
         """
-        found = None
+        named_registration = None
         if registration is not None:
             with under(path) if path else nullcontext():
                 await self._catalog.header(scene)
-                found = await self._registration(registration, scene)
+                named_registration = await self._registration(registration, scene)
 
         def resolved(info: SceneInfo) -> Resolved:
             return complete(self._resolved(info, request, encoding, registration))
 
-        plan = Plan(self._catalog, scene, resolved, path, found)
+        plan = Plan(self._catalog, scene, resolved, path, named_registration)
         await plan.renew()
         return plan
 
@@ -186,7 +186,7 @@ class RequestPlanner:
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
 
 
-class Asked(Generic[S]):
+class PendingFrames(Generic[S]):
     """Frames that wait for their turn, or are rendered. A context manager, which ends that.
 
     They are asked for again where the scene's file has changed by their turn.
@@ -218,7 +218,7 @@ class Asked(Generic[S]):
     def close(self) -> None:
         self._turn.close()
 
-    def __enter__(self) -> Asked[S]:
+    def __enter__(self) -> PendingFrames[S]:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -249,7 +249,7 @@ class Rendering:
         settings: S | None = None,  # in place of the plan's: a part of it
     ) -> RenderResult[S]:
         """Renders for the scene that is there by then. Raises what RenderPool.render and Plan.renew raise."""
-        asked = self.ask(
+        pending = self.ask(
             plan,
             poses,
             deadline=deadline,
@@ -258,8 +258,8 @@ class Rendering:
             destination=destination,
             settings=settings,
         )
-        with asked:
-            return await asked.frames()
+        with pending:
+            return await pending.frames()
 
     def ask(
         self,
@@ -271,7 +271,7 @@ class Rendering:
         begin_by: float | None = None,  # likewise
         destination: Destination | None = None,
         settings: S | None = None,
-    ) -> Asked[S]:
+    ) -> PendingFrames[S]:
         """As `render`, which waits for the frames: has them wait for their turn at once. Raises what RenderPool.ask
         raises, and SceneNotFound.
         """
@@ -292,7 +292,7 @@ class Rendering:
             begin_by,
             destination,
         )
-        return Asked(self.pool, plan, request, settings)
+        return PendingFrames(self.pool, plan, request, settings)
 
     async def render_slice(
         self, plan: Plan[SliceView], pose: FloatArray, *, deadline: float | None

@@ -44,8 +44,8 @@ def point_message(path: Path, info: SceneInfo, limit: int, fields: Sequence[str]
 
 def even_selection(count: int, limit: int) -> npt.NDArray[np.int64]:
     """Places of at most `limit` of `count` things, in order."""
-    taken = min(count, limit)
-    return np.arange(taken) * count // max(taken, 1)
+    size = min(count, limit)
+    return np.arange(size) * count // max(size, 1)
 
 
 def _columns(path: Path, info: SceneInfo, limit: int, wanted: set[str]) -> dict[str, FloatArray]:  # [P] each

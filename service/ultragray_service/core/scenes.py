@@ -46,7 +46,7 @@ PATIENCE_S = 10.0  # of frames that wait for a scene
 
 
 class ScenePlaces(Collector):
-    """`data`, whose scenes are the operator's, and `made`, whose scenes were imported or made by jobs."""
+    """`data`, whose scenes are the operator's, and `artifacts`, whose scenes were imported or made by jobs."""
 
     def __init__(self, settings: Settings) -> None:
         if isinstance(settings.data_folder, Path) and not settings.data_folder.is_dir():
@@ -56,8 +56,8 @@ class ScenePlaces(Collector):
         self.cache = Cache(settings.cache, settings.max_cache_bytes)
         self._settings = settings
         self.data = self._shelf(settings.data_folder, "")
-        self.made = self._shelf(settings.artifacts, SCENES_FOLDER)
-        self._shelves = (self.data, self.made)
+        self.artifacts = self._shelf(settings.artifacts, SCENES_FOLDER)
+        self._shelves = (self.data, self.artifacts)
 
     @property
     def problem(self) -> StorageUnavailable | None:
@@ -75,8 +75,8 @@ class ScenePlaces(Collector):
         yield counter("ultragray_scene_cache_misses", "Scenes that were fetched from a bucket.", counts.misses)
         yield counter("ultragray_scene_cache_fetched_bytes", "Bytes of those.", counts.fetched_bytes)
         yield counter("ultragray_scene_cache_fetch_seconds", "Time that their fetches took in all.", counts.fetch_s)
-        held = self.cache.held_bytes() if far else 0
-        yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", held)
+        cache_bytes = self.cache.held_bytes() if far else 0
+        yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", cache_bytes)
         errors = sum(one.unavailable_total for one in far)
         yield counter("ultragray_scene_list_errors", "Times that a bucket did not tell its scenes.", errors)
         age = max((one.age_s for one in far), default=0.0)
@@ -370,7 +370,7 @@ class Scenes:
 
     async def page(self, page_size: int, page_token: str) -> ScenePage:
         entries, next_page_token = await self._catalog.page(page_size, page_token)
-        loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.made)
+        loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.artifacts)
         rows = [
             _entry(one, one.name in loaded, one.name in removable, self._owners.known(Kind.SCENE, one.name))
             for one in entries

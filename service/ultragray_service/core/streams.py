@@ -20,7 +20,7 @@ from ultragray.rendering.settings import RenderSettings, Resolved
 from ultragray_service.core.clocks import ClientClock, ClockStamps, service_time_s
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.previews import RealFrame, StreamPreview
-from ultragray_service.core.rendering import Asked, Plan, Rendering
+from ultragray_service.core.rendering import PendingFrames, Plan, Rendering
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult
 
@@ -66,28 +66,28 @@ class _Underway:
 
     sequence: int
     client_time: float | None
-    frames: Asked[Resolved] | UltragrayError  # or why there are none
-    left: Callable[[], None]  # called when it has been written
+    frames: PendingFrames[Resolved] | UltragrayError  # or why there are none
+    release: Callable[[], None]  # called when it has been written
     request: PoseRequest | None = None  # the newest that its frame is for
 
 
 class _Room:
     def __init__(self) -> None:
         self._count = self._bytes = 0
-        self._left = asyncio.Event()
+        self._departure = asyncio.Event()
 
     async def enter(self, size: int) -> None:
         """Waits until there is room for an answer of so many bytes; alone it may be of any size."""
         while self._count and (self._count >= MAX_FRAMES_IN_FLIGHT or self._bytes + size > MAX_BYTES_IN_FLIGHT):
-            self._left.clear()
-            await self._left.wait()
+            self._departure.clear()
+            await self._departure.wait()
         self._count += 1
         self._bytes += size
 
     def leave(self, size: int) -> None:
         self._count -= 1
         self._bytes -= size
-        self._left.set()
+        self._departure.set()
 
 
 class _Window:
@@ -116,7 +116,7 @@ class _Window:
     def enter(self, sequence: int) -> None:
         self._entered.append(sequence)
 
-    def sent(self) -> None:
+    def leave(self) -> None:
         if self._size is None:
             self._entered.popleft()
 
@@ -136,7 +136,7 @@ class PoseStream:
         self._record = record or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
-        self._open: set[Asked[Resolved]] = set()  # frames that are still to be answered
+        self._open: set[PendingFrames[Resolved]] = set()  # frames that are still to be answered
         self._ended = False  # no more poses come
         self._dropped = 0
         # Of a latest stream: what is asked of the pool, and what comes after it.
@@ -192,10 +192,10 @@ class PoseStream:
             try:
                 await self._rendering.limits.frame_turn(request.deadline)
             except UltragrayError as error:
-                frames: Asked[Resolved] | UltragrayError = self._refused(error)
+                frames: PendingFrames[Resolved] | UltragrayError = self._refused(error)
             else:
-                frames = self._asked(request)
-            self._begin(request, frames, left=partial(self._room.leave, size))
+                frames = self._request_frames(request)
+            self._begin(request, frames, release=partial(self._room.leave, size))
             return
         if self._next is None and self._take_over(request):
             self._count_dropped()
@@ -216,7 +216,7 @@ class PoseStream:
         """Takes a message that gets no frame. Waits while too many answers are under way."""
         await self._room.enter(0)
         self._answers.put_nowait(
-            _Underway(sequence, client_time, self._refused(error), left=partial(self._room.leave, 0))
+            _Underway(sequence, client_time, self._refused(error), release=partial(self._room.leave, 0))
         )
 
     async def _read(self, read: Callable[[], Awaitable[None]]) -> None:
@@ -232,7 +232,7 @@ class PoseStream:
             self._record.note(answer)
             write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
             await write(answer)
-            underway.left()
+            underway.release()
 
     async def _answer(self, underway: _Underway) -> StreamAnswer:
         """Waits for a frame. That of a latest stream makes way for the next pose before it is written."""
@@ -246,10 +246,10 @@ class PoseStream:
         if request is not None and request.correct is not None and not isinstance(outcome, UltragrayError):
             outcome, preview = await request.correct(outcome)
         dropped, self._dropped = self._dropped, 0
-        asked = underway if request is None else request
+        origin = underway if request is None else request
         return StreamAnswer(
-            asked.sequence,
-            asked.client_time,
+            origin.sequence,
+            origin.client_time,
             outcome,
             dropped,
             prediction=None if request is None else request.prediction,
@@ -272,24 +272,24 @@ class PoseStream:
             frames.close()
             self._open.discard(frames)
 
-    def _asked(self, request: PoseRequest) -> Asked[Resolved] | UltragrayError:
+    def _request_frames(self, request: PoseRequest) -> PendingFrames[Resolved] | UltragrayError:
         """The frame of a pose, which waits in the pool from now on; else why there will be none."""
         destination = self.destination if request.correct is None else None  # its pixels are made here
         try:
-            asked = self._rendering.ask(
+            frames = self._rendering.ask(
                 request.plan, request.pose[None], deadline=request.deadline, destination=destination
             )
         except UltragrayError as error:
             return self._refused(error)
         except Exception as error:
             return self._refused(unexpected(error))
-        self._open.add(asked)
-        return asked
+        self._open.add(frames)
+        return frames
 
     def _begin(
-        self, request: PoseRequest, frames: Asked[Resolved] | UltragrayError, left: Callable[[], None]
+        self, request: PoseRequest, frames: PendingFrames[Resolved] | UltragrayError, release: Callable[[], None]
     ) -> _Underway:
-        underway = _Underway(request.sequence, request.client_time, frames, left, request)
+        underway = _Underway(request.sequence, request.client_time, frames, release, request)
         self._answers.put_nowait(underway)
         return underway
 
@@ -332,10 +332,10 @@ class PoseStream:
     def _ask_next(self) -> None:
         assert self._next is not None
         request, self._next = self._next, None
-        self._current = self._begin(request, self._asked(request), left=self._left_latest)
+        self._current = self._begin(request, self._request_frames(request), release=self._leave_window)
 
-    def _left_latest(self) -> None:
-        self._window.sent()
+    def _leave_window(self) -> None:
+        self._window.leave()
         self._advance()
 
     def _count_dropped(self) -> None:
@@ -452,7 +452,7 @@ class FrameStream:
 
     async def _take(self, message: Message) -> None:
         try:
-            request = await self._asked(message)
+            request = await self._pose_request(message)
         except UltragrayError as error:
             await self._poses.refuse(message.sequence, message.client_time, error)
         except Exception as error:
@@ -461,7 +461,7 @@ class FrameStream:
             if request is not None:
                 await self._poses.ask(request)
 
-    async def _asked(self, message: Message) -> PoseRequest | None:
+    async def _pose_request(self, message: Message) -> PoseRequest | None:
         await self._change_settings(message)
         if (real := message.real()) is not None:
             await self._preview.take(real, self._plan)

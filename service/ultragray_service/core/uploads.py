@@ -297,20 +297,20 @@ class SceneImports:
         """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end."""
         check_scene_name(name)
         await self._require_free(name)
-        async with self._room(name) as (received, max_bytes):
-            await self._write(received, blocks, max_bytes)
-            yield received
+        async with self._room(name) as (file, max_bytes):
+            await self._write(file, blocks, max_bytes)
+            yield file
 
-    async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
+    async def accept(self, file: Path, name: str, *, private: bool) -> SceneHeader:
         """Checks a file that was received and serves it as the scene `name`; cancelling ends the check."""
         check = self._means.checks.run(
             check_scene_file,
-            {"path": str(received)},
+            {"path": str(file)},
             what="checking the scene",
             timeout_s=SCENE_CHECK_TIMEOUT_S,
             killed=SceneFileInvalid,
         )
-        return await self._named(received, name, check, private=private)
+        return await self._named(file, name, check, private=private)
 
     async def make(self, name: str, make: Make, *, replace: bool, private: bool) -> SceneHeader:
         """Serves a file that `make` writes as the scene `name`; cancelling ends the making.
@@ -322,18 +322,18 @@ class SceneImports:
         before = await asyncio.to_thread(self._replaceable, name) if replace else None
         if before is None:
             await self._require_free(name)
-        async with self._room(name) as (made, max_bytes):
+        async with self._room(name) as (output, max_bytes):
 
             async def making() -> None:
-                await make(made, None if before is None else await asyncio.to_thread(self._store.path, name))
-                if made.stat().st_size > max_bytes:
+                await make(output, None if before is None else await asyncio.to_thread(self._store.path, name))
+                if output.stat().st_size > max_bytes:
                     raise UploadTooLarge(f"a scene file may have at most {max_bytes} bytes", field="body")
 
             if before is None:
-                return await self._named(made, name, making(), private=private)
+                return await self._named(output, name, making(), private=private)
             await making()
-            header = await asyncio.to_thread(read_header, made)
-            await to_its_end(partial(self._replace, made, name, before))
+            header = await asyncio.to_thread(read_header, output)
+            await to_its_end(partial(self._replace, output, name, before))
             return header
 
     @asynccontextmanager
@@ -376,11 +376,11 @@ class SceneImports:
             raise PermissionDenied(f"the scene {name!r} is not yours: choose another name", field="scene")
         return self._store.sha256(name)
 
-    def _replace(self, made: Path, name: str, before: str) -> None:
+    def _replace(self, output: Path, name: str, before: str) -> None:
         if self._replaceable(name) != before:
             raise SceneExists(f"the scene {name!r} has become another one meanwhile: ask again", field="scene")
-        sync(made)
-        self._shelf.replace(made, name)
+        sync(output)
+        self._shelf.replace(output, name)
         self._store.forget(name)
 
     async def delete(self, name: str) -> None:
@@ -392,19 +392,19 @@ class SceneImports:
         await asyncio.to_thread(self._shelf.remove_abandoned)
 
     async def _write(self, path: Path, blocks: AsyncIterator[bytes], max_bytes: int) -> None:
-        received = 0
+        size = 0
         with path.open("xb") as file:
             async for block in blocks:
-                received += len(block)
-                if received > max_bytes:
+                size += len(block)
+                if size > max_bytes:
                     raise UploadTooLarge(f"a scene file may have at most {max_bytes} bytes", field="body")
                 await asyncio.to_thread(file.write, block)
             await asyncio.to_thread(file.flush)
         await in_own_thread(lambda: sync(path))
 
-    def _publish(self, received: Path, name: str, claim: Claim) -> None:
+    def _publish(self, file: Path, name: str, claim: Claim) -> None:
         try:
-            self._shelf.publish(received, name)
+            self._shelf.publish(file, name)
         except SceneExists:  # another one was quicker
             raise self._exists(name) from None
         claim.is_made = True

@@ -268,10 +268,10 @@ def create_app(service: Service) -> FastAPI:
         app.include_router(router)
     add_docs(app)
     add_console(app, token_origin=lambda: _token_origin(service))
-    found = (*app.routes, *(route for router in _ROUTERS for route in router.routes))
-    app.state.routes = [route for route in found if isinstance(route, Route)]
+    routes = (*app.routes, *(route for router in _ROUTERS for route in router.routes))
+    app.state.routes = [route for route in routes if isinstance(route, Route)]
     rules = HttpRules()
-    rules.require_all(_asked_for(found))
+    rules.require_all(_method_paths(routes))
     app.add_exception_handler(UltragrayError, problems.answer_ultragray_error)
     app.add_exception_handler(HTTPException, problems.answer_http_exception)
     app.add_exception_handler(RequestValidationError, problems.answer_validation_error)
@@ -298,7 +298,7 @@ def _token_origin(service: Service) -> str | None:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def _asked_for(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:
+def _method_paths(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:
     for route in routes:
         match route:
             case WebSocketRoute():
@@ -322,13 +322,13 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            found, extra = TypeAdapter.json_schemas(
+            definitions, extra = TypeAdapter.json_schemas(
                 [(cls, "validation", adapter_of(cls)) for cls in _READ]
                 + [(cls, "serialization", adapter_of(cls)) for cls in _WRITTEN],
                 ref_template="#/components/schemas/{model}",
             )
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
-            schemas.update({cls.__name__: schema for (cls, _), schema in found.items() if "$ref" not in schema})
+            schemas.update({cls.__name__: schema for (cls, _), schema in definitions.items() if "$ref" not in schema})
             schemas.update(extra["$defs"])
             schemas[TrainingConfig.__name__][PRESETS_SET] = PRESETS
             schemas[Probe.__name__][NAMED] = {name: to_dict(probe) for name, probe in Probe.named.items()}

@@ -480,9 +480,9 @@ class RegistrationBody(Registration):
 def _body_of(kind: str) -> type[Any]:
     """The class of a specification's JSON, which `kind` stands beside: poses are lists."""
     cls = Specification.member(kind)
-    given = [(item, annotation) for item, annotation in annotated_fields(cls) if item.name != "kind"]
+    fields = [(item, annotation) for item, annotation in annotated_fields(cls) if item.name != "kind"]
     described_fields: list[tuple[str, Any, Any]] = [
-        (item.name, _without_arrays(annotation), _again(item)) for item, annotation in given
+        (item.name, _without_arrays(annotation), _again(item)) for item, annotation in fields
     ]
     name = f"{kind.title()}Specification"
     return make_dataclass(name, described_fields, namespace={"__doc__": cls.__doc__}, kw_only=True)

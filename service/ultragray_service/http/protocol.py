@@ -389,8 +389,8 @@ class _BoundedWebSocket(PromptWebSocket):
 
     def _count_empty(self) -> None:
         now = self.loop.time()
-        left = self._empty_frames - EMPTY_FRAMES_PER_S * (now - self._counted_at)
-        self._empty_frames, self._counted_at = max(0.0, left) + 1.0, now
+        remaining = self._empty_frames - EMPTY_FRAMES_PER_S * (now - self._counted_at)
+        self._empty_frames, self._counted_at = max(0.0, remaining) + 1.0, now
         if self._empty_frames > MAX_EMPTY_FRAMES and not self._is_over and not self.transport.is_closing():
             self._is_over = True
             self.conn.fail(_POLICY_VIOLATION, "too many pings, pongs or empty frames")

@@ -102,17 +102,17 @@ class Reply:
         if errors:
             root.set("Error", _plain(errors))
         for parameter, error, value in self.outcomes:
-            found = ElementTree.SubElement(root, "Parameter", Name=parameter)
-            found.set("Success", "false" if error else "true")
+            element = ElementTree.SubElement(root, "Parameter", Name=parameter)
+            element.set("Success", "false" if error else "true")
             if value is not None:
-                found.set("Value", _plain(value))
+                element.set("Value", _plain(value))
         return ElementTree.tostring(root, encoding="unicode")
 
     @property
     def metadata(self) -> dict[str, str]:
         """The reply as messages of version 2 carry it beside the XML."""
-        found = {parameter: "FAIL" if error else value or "SUCCESS" for parameter, error, value in self.outcomes}
-        return {**found, **({"Status": "FAIL", "Error": self.errors} if self.errors else {"Status": "SUCCESS"})}
+        values = {parameter: "FAIL" if error else value or "SUCCESS" for parameter, error, value in self.outcomes}
+        return {**values, **({"Status": "FAIL", "Error": self.errors} if self.errors else {"Status": "SUCCESS"})}
 
 
 def read_request(name: str, text: str) -> tuple[str, Mapping[str, str | None]]:
@@ -188,14 +188,14 @@ class ClientTools:
 
         `registration` leads from the frame that the poses of the devices lead to into the scene; None: it is the scene.
         """
-        found = []
+        tools = []
         for one in self.tools:
             if one.device is None:
-                found.append(one.tool)
+                tools.append(one.tool)
             elif (pose := self.poses.get(one.device)) is not None:
                 to_scene = pose if registration is None else registration.marker_to_scene(pose)
-                found.append(one.tool.moved(to_scene))
-        return tuple(found)
+                tools.append(one.tool.moved(to_scene))
+        return tuple(tools)
 
 
 def read_tools(text: str, before: ClientTools) -> ClientTools:
@@ -424,29 +424,29 @@ async def answer(scanner: Scanner, message: Message) -> Message:
 
 async def _reply(scanner: Scanner, name: str, text: str) -> Reply:
     try:
-        asked, parameters = read_request(name, text)
+        command_name, parameters = read_request(name, text)
         known = {name.casefold(): name for name in (_SET, _GET)}
-        if (command := known.get(asked.casefold())) is None:
-            raise _invalid(f"the command must be {_SET} or {_GET}, got {shown(asked)}")
+        if (command := known.get(command_name.casefold())) is None:
+            raise _invalid(f"the command must be {_SET} or {_GET}, got {shown(command_name)}")
         if not parameters:
             raise _invalid(f'{command} must hold an element <Parameter Name="…"/> or more')
     except IgtlMessageInvalid as error:
         return Reply(name, error.detail)
     outcomes: list[tuple[str, str, str | None]] = []
     for parameter, value in parameters.items():
-        problem, found = "", None
+        problem, answer = "", None
         try:
             if command == _GET:
-                found = await scanner.get(parameter)
+                answer = await scanner.get(parameter)
             elif value is None:
                 problem = f"{parameter}: a Value is required"
             else:
                 await scanner.set(parameter, value)
         except UltragrayError as error:
             problem = f"{parameter}: {error.detail}"
-        outcomes.append((parameter, problem, found))
+        outcomes.append((parameter, problem, answer))
     return Reply(command, outcomes=tuple(outcomes))
 
 
-def _message(type_name: str, asked: Message, device_name: str, content: bytes, metadata: Mapping[str, str]) -> Message:
-    return Message(type_name, device_name, content, asked.timestamp, asked.version, asked.message_id, metadata)
+def _message(type_name: str, query: Message, device_name: str, content: bytes, metadata: Mapping[str, str]) -> Message:
+    return Message(type_name, device_name, content, query.timestamp, query.version, query.message_id, metadata)

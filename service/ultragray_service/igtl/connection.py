@@ -120,10 +120,10 @@ class Connection:
         self._writer.transport.abort()
 
     async def _take_message(self) -> None:
-        begun = await self._reader.readexactly(1)
+        first_byte = await self._reader.readexactly(1)
         slow = asyncio.get_running_loop().call_later(MESSAGE_TIMEOUT_S, self.abort)
         try:
-            header = unpack_header(begun + await self._reader.readexactly(HEADER_BYTES - 1))
+            header = unpack_header(first_byte + await self._reader.readexactly(HEADER_BYTES - 1))
             if header.body_bytes > MAX_SKIPPED_BYTES:
                 raise _too_large(header, MAX_SKIPPED_BYTES)
             is_read = header.type_name in UNDERSTOOD and header.body_bytes <= MAX_BODY_BYTES
@@ -137,12 +137,12 @@ class Connection:
         await self._answer(header, body, time.perf_counter())
 
     async def _skip(self, header: Header) -> None:
-        left = header.body_bytes
-        while left:
-            chunk = await self._reader.read(min(left, _SKIP_BYTES))
+        rest_bytes = header.body_bytes
+        while rest_bytes:
+            chunk = await self._reader.read(min(rest_bytes, _SKIP_BYTES))
             if not chunk:
-                raise asyncio.IncompleteReadError(b"", left)
-            left -= len(chunk)
+                raise asyncio.IncompleteReadError(b"", rest_bytes)
+            rest_bytes -= len(chunk)
 
     async def _answer(self, header: Header, body: bytes | None, arrived: float) -> None:
         about = Message(header.type_name, header.device_name, timestamp=header.timestamp, version=header.version)
@@ -255,10 +255,10 @@ class Connection:
         else:
             self._publish(frame, self)
             self._note(frame.posed, frame.result)
-            asked = frame.posed.message
+            request = frame.posed.message
             if not self.feed.films(frame):
-                await self._send(frame.message("IMAGE", asked.version, asked.message_id))
-            self._count(asked.type_name, "OK", frame.posed.arrived)
+                await self._send(frame.message("IMAGE", request.version, request.message_id))
+            self._count(request.type_name, "OK", frame.posed.arrived)
 
     def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:
         self.record.name = posed.message.device_name

@@ -19,7 +19,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.rendering.display import true_to_scale
 from ultragray.rendering.settings import Encoding, Resolved, settings_used
 from ultragray.scene.confidence import Extrapolation
-from ultragray_service.core.rendering import Asked
+from ultragray_service.core.rendering import PendingFrames
 from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
@@ -57,7 +57,7 @@ class Underway:
     """A request to the render pool; while it waits there, a newer pose takes its turn, unless the setup has changed."""
 
     posed: PoseMessage
-    asked: Asked | None = None  # once it waits there
+    pending: PendingFrames | None = None  # once it waits there
     setup: Setup | None = None  # that it is rendered with, once that is known
     registration: Registration | None = None  # likewise
 
@@ -67,9 +67,9 @@ class Underway:
 
     def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
         """Whether a newer pose, of a client with that setup now, has taken the turn."""
-        if self.setup is not setup or self.asked is None:
+        if self.setup is not setup or self.pending is None:
             return False
-        if not self.asked.give_to(self._placed(posed.pose)[None], deadline):
+        if not self.pending.give_to(self._placed(posed.pose)[None], deadline):
             return False
         self.posed = replace(posed, replaced=self.posed.replaced + 1)
         return True
@@ -182,8 +182,8 @@ class Frame:
         }
 
 
-def _texts(told: Extrapolation | Prediction | None) -> dict[str, str]:
-    known = {} if told is None else asdict(told)
+def _texts(figures: Extrapolation | Prediction | None) -> dict[str, str]:
+    known = {} if figures is None else asdict(figures)
     return {name: f"{value:.3f}" for name, value in known.items() if value is not None}
 
 
@@ -202,22 +202,22 @@ async def render_frame(service: Service, scenes: SceneChooser, scanner: Scanner,
     service.life.require_serving()
     scene = await scenes.choose(underway.posed.message.device_name)
     ownership = service.owners.known(Kind.SCENE, scene)
-    setup, found = scanner.setup, None
+    setup, registration = scanner.setup, None
     if setup.registration is not None:
-        found = await service.registrations.of_scene(setup.registration, scene)
-    underway.setup, underway.registration = setup, found
-    asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
+        registration = await service.registrations.of_scene(setup.registration, scene)
+    underway.setup, underway.registration = setup, registration
+    request = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(registration)) else setup.settings
 
     def complete(settings: Resolved) -> Resolved:
         to_scale = true_to_scale(settings.probe, settings.height, service.settings.max_image_side)
         display = replace(settings.display, pixel_mm=to_scale.pixel_mm)
         return replace(settings, display=display, registration=setup.registration)
 
-    plan = await service.planner.plan(scene, asked, Encoding.UINT8, complete=complete)
+    plan = await service.planner.plan(scene, request, Encoding.UINT8, complete=complete)
     deadline = service.planner.deadline(None)
-    with service.rendering.ask(plan, underway.pose[None], deadline=deadline) as underway.asked:
-        result = await underway.asked.frames()
-    return Frame(underway.posed, result, image_of(result, found), ownership, found)
+    with service.rendering.ask(plan, underway.pose[None], deadline=deadline) as underway.pending:
+        result = await underway.pending.frames()
+    return Frame(underway.posed, result, image_of(result, registration), ownership, registration)
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:

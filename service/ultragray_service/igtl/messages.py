@@ -60,10 +60,10 @@ def unpack_header(data: bytes) -> Header:
 
 def unpack_message(header: Header, body: bytes) -> Message:
     """The message of a header and its body. Raises IgtlMessageInvalid; its field is `crc` or `body`."""
-    found = crc64.ecma_182(body)
-    if found != header.crc:
+    crc = crc64.ecma_182(body)
+    if crc != header.crc:
         raise IgtlMessageInvalid(
-            f"{header.type_name}: the CRC-64 of the body must be {header.crc:016x} as in the header, got {found:016x}",
+            f"{header.type_name}: the CRC-64 of the body must be {header.crc:016x} as in the header, got {crc:016x}",
             field="crc",
         )
     if header.version == 1:

@@ -100,9 +100,9 @@ class IgtlServer:
 
     async def _run(self, connection: Connection, task: asyncio.Task[None], principal: Principal) -> None:
         """Waits for the end of a connection. Raises Unauthenticated where everybody's rights end with the first key."""
-        held = self._service.sessions.held(LOCAL, None) if principal is LOCAL else contextlib.nullcontext()
+        session = self._service.sessions.held(LOCAL, None) if principal is LOCAL else contextlib.nullcontext()
         try:
-            with held:
+            with session:
                 await asyncio.shield(task)
         except UltragrayError as error:
             connection.dismiss(error)

@@ -141,14 +141,14 @@ def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specificatio
     kind = message.WhichOneof("specification")
     if kind is None:
         raise InvalidArgument(f"specification must hold one of {', '.join(KINDS)}", field="specification")
-    asked = getattr(message, kind)
+    body = getattr(message, kind)
     with under(kind):
-        given = {"poses": read_poses(asked.poses, "poses") if asked.poses else None} if hasattr(asked, "poses") else {}
-        specification: Specification = read(asked, Specification.member(kind), **given)
+        values = {"poses": read_poses(body.poses, "poses") if body.poses else None} if hasattr(body, "poses") else {}
+        specification: Specification = read(body, Specification.member(kind), **values)
     return specification, kind
 
 
 def job_message(job: Job) -> jobs_pb2.Job:
     error = None if job.reason is None else scenes_pb2.Error(reason=job.error or "", detail=job.reason)
-    shown = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
-    return to_message(shown, jobs_pb2.Job, error=error)
+    view = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
+    return to_message(view, jobs_pb2.Job, error=error)

@@ -116,7 +116,7 @@ class CallTransport:
         return Message(
             sequence=message.sequence,
             client_time=client_time_ns,
-            mode=partial(self._begun, message),
+            mode=partial(self._begin, message),
             window=message.window or None,
             acknowledged=message.acknowledged if has("acknowledged") else None,
             settings=lambda: read_settings(message) if has("settings") else None,
@@ -133,7 +133,7 @@ class CallTransport:
             ),
         )
 
-    def _begun(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
+    def _begin(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
         """The mode that the first message asks for; opens the memory that the client shares, too.
 
         Raises InvalidArgument for a mode that does not exist, a latest stream without a window or with one beyond the
@@ -247,8 +247,8 @@ class RenderService:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
         plan = await self._plan(request)
-        sent = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
-        poses = plan.placed(sent)
+        inputs = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        poses = plan.placed(inputs)
         window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
         in_flight: deque[asyncio.Task[RenderResult]] = deque()
         started = 0
@@ -272,8 +272,8 @@ class RenderService:
             await asyncio.gather(*in_flight, return_exceptions=True)
 
     async def RenderStream(self, messages: object, context: Context) -> None:
-        told = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
-        name = told.get(_STREAM_NAME) or told.get("user-agent", "")
+        metadata = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
+        name = metadata.get(_STREAM_NAME) or metadata.get("user-agent", "")
         streams = self._service.streams
         with self._service.limits.stream(), streams.opened("grpc", name) as noted:
             async with CallTransport(context) as transport:
@@ -285,39 +285,39 @@ class RenderService:
         check_pose_count(len(request.poses), self._service.planner.max_poses)
         whose = read(request, OfProbe)
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
-        found = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
-        return to_message(found, rendering_pb2.AssessPosesResponse)
+        assessment = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
+        return to_message(assessment, rendering_pb2.AssessPosesResponse)
 
     async def RenderSlice(self, request: rendering_pb2.RenderSliceRequest, context: Context) -> rendering_pb2.Slice:
         deadline = self._service.planner.deadline(context.time_remaining())
         if not request.HasField("slice"):
             raise InvalidArgument("slice is required", field="slice")
         with under("slice"):
-            asked = read(request.slice, SliceSettings)
-        plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
+            settings = read(request.slice, SliceSettings)
+        plan = await self._service.planner.plan_slice(request.scene, settings, settings.numbers, path="slice")
         await self._service.limits.take_frames(1, deadline)
-        result = await self._service.rendering.render_slice(plan, asked.pose(), deadline=deadline)
+        result = await self._service.rendering.render_slice(plan, settings.pose(), deadline=deadline)
         return slice_message(result)
 
     async def Localize(
         self, request: rendering_pb2.LocalizeRequest, context: Context
     ) -> rendering_pb2.LocalizeResponse:
         deadline = self._service.planner.deadline(context.time_remaining())
-        asked = read(request, LocalizationSettings)
+        settings = read(request, LocalizationSettings)
         height, width = (
             getattr(request, side) if request.HasField(side) else None for side in ("image_height", "image_width")
         )
         start = read_pose(request.start, "start") if request.HasField("start") else None
-        sought = sought_frame(request.image, height, width, asked)
+        sought = sought_frame(request.image, height, width, settings)
         registration = request.registration if request.HasField("registration") else None
-        found = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)
-        return to_message(found, rendering_pb2.LocalizeResponse)
+        match = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)
+        return to_message(match, rendering_pb2.LocalizeResponse)
 
     async def PlanViews(
         self, request: rendering_pb2.PlanViewsRequest, context: Context
     ) -> rendering_pb2.PlanViewsResponse:
         deadline = self._service.planner.deadline(context.time_remaining())
-        asked, poses = read(request, PlanSettings), None
+        settings, poses = read(request, PlanSettings), None
         if count := len(request.poses):
             check_pose_count(count, MAX_LISTED)
             poses = await exact_poses(count, lambda index: read_pose(request.poses[index], f"poses[{index}]"))
@@ -325,22 +325,22 @@ class RenderService:
             read_pose(getattr(request, name), name) if request.HasField(name) else None for name in ("view", "start")
         )
         registration = request.registration if request.HasField("registration") else None
-        found = await next_views(
+        view_plan = await next_views(
             self._service.rendering,
             request.scene,
-            asked,
+            settings,
             deadline,
             poses=poses,
             view=view,
             start=start,
             registration=registration,
         )
-        return to_message(found, rendering_pb2.PlanViewsResponse)
+        return to_message(view_plan, rendering_pb2.PlanViewsResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
-        scene, asked = read_settings(request)
+        scene, settings = read_settings(request)
         return await self._service.planner.plan(
-            scene, asked, asked.encoding, path="settings", registration=asked.registration
+            scene, settings, settings.encoding, path="settings", registration=settings.registration
         )
 
     async def _in_turn(

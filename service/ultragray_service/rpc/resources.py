@@ -91,9 +91,9 @@ async def _submit_job(service: Service, request: Any) -> Mapping[str, Any]:
 async def _estimate_job(service: Service, request: Any) -> jobs_pb2.JobEstimate:
     service.life.require_serving()
     specification, field = await asyncio.to_thread(read_specification, request)
-    found = await estimate(service.rendering, specification, field=field)
-    poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in found.poses]
-    return to_message(replace(found, poses=[]), jobs_pb2.JobEstimate, poses=poses)
+    job_estimate = await estimate(service.rendering, specification, field=field)
+    poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in job_estimate.poses]
+    return to_message(replace(job_estimate, poses=[]), jobs_pb2.JobEstimate, poses=poses)
 
 
 async def _list_jobs(service: Service, request: Any) -> Mapping[str, Any]:
@@ -269,12 +269,12 @@ async def _record_frames(service: Service, requests: Any, context: Context) -> N
 
 
 async def _download_artifact(service: Service, request: Any, context: Context) -> None:
-    found = await service.jobs.do(JobStore.artifact, request.job, request.name)
-    length, offset = found.stored.bytes, request.offset
+    artifact = await service.jobs.do(JobStore.artifact, request.job, request.name)
+    length, offset = artifact.stored.bytes, request.offset
     if not 0 <= offset <= length:
         raise InvalidArgument(f"offset must be from 0 to {length}, got {offset}", field="offset")
     while True:
-        data = await asyncio.to_thread(found.read, offset, _CHUNK_BYTES)
+        data = await asyncio.to_thread(artifact.read, offset, _CHUNK_BYTES)
         await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=length))
         offset += len(data)
         if not data or offset >= length:

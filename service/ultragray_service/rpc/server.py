@@ -85,7 +85,7 @@ class GrpcServer:
             ],
         )
         self._health = Health()
-        self._told = dict.fromkeys(("", *SERVICE_NAMES), False)
+        self._states = dict.fromkeys(("", *SERVICE_NAMES), False)
         rendering = RenderService(service)
         for one in _DESCRIPTORS.values():
             handlers = {method.name: _handler(service, rendering, method) for method in one.methods}
@@ -103,7 +103,7 @@ class GrpcServer:
 
     async def start(self) -> None:
         """Begins to answer; health says NOT_SERVING until told otherwise."""
-        for name in self._told:
+        for name in self._states:
             await self._health.set(name, health_pb2.HealthCheckResponse.NOT_SERVING)
         await self._server.start()
 
@@ -119,10 +119,10 @@ class GrpcServer:
             "AccessService": True,
             "RegistrationService": parts.jobs.ready,
         }
-        told = {_DESCRIPTORS[name].full_name: is_serving for name, is_serving in serving.items()}
-        for name, is_serving in {"": readiness.problem is None, **told}.items():
-            if self._told[name] is not is_serving:
-                self._told[name] = is_serving
+        states = {_DESCRIPTORS[name].full_name: is_serving for name, is_serving in serving.items()}
+        for name, is_serving in {"": readiness.problem is None, **states}.items():
+            if self._states[name] is not is_serving:
+                self._states[name] = is_serving
                 code = health_pb2.HealthCheckResponse
                 await self._health.set(name, code.SERVING if is_serving else code.NOT_SERVING)
 

@@ -34,40 +34,40 @@ FREE, _LENT = b"\1", b"\0"
 class SharedMemory:
     """The file of one stream. It is written to, never mapped: a client that truncates it harms nobody but itself."""
 
-    def __init__(self, asked: rendering_pb2.SharedMemory, peer: str) -> None:
+    def __init__(self, request: rendering_pb2.SharedMemory, peer: str) -> None:
         """Opens the file and removes its name. Raises InvalidArgument for one that the peer may not share."""
         if not is_loopback(address_of(peer)):
             raise InvalidArgument(
                 f"{_FIELD} is for clients that reach the service by a loopback address, got one at {peer}", field=_FIELD
             )
-        _check_sizes(asked)
-        self._slots, self._slot_bytes = asked.slots, asked.slot_bytes
-        self._allocated = [0] * asked.slots  # bytes of each
+        _check_sizes(request)
+        self._slots, self._slot_bytes = request.slots, request.slot_bytes
+        self._allocated = [0] * request.slots  # bytes of each
         self.socket: socket.socket | None = None  # for the messages of the stream
-        path = f"{FOLDER}/{asked.name}"
+        path = f"{FOLDER}/{request.name}"
         try:
             self._descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            raise _refused(asked, f"the service cannot open it: {error.strerror}") from None
+            raise _refused(request, f"the service cannot open it: {error.strerror}") from None
         try:
-            self._check_file(asked)
-            if asked.has_socket:
-                self.socket = _connected(asked, f"{path}{_SOCKET}")
+            self._check_file(request)
+            if request.has_socket:
+                self.socket = _connected(request, f"{path}{_SOCKET}")
         except BaseException:
             self.close()
             raise
         with suppress(OSError):
             os.unlink(path)
 
-    def _check_file(self, asked: rendering_pb2.SharedMemory) -> None:
+    def _check_file(self, request: rendering_pb2.SharedMemory) -> None:
         status = os.fstat(self._descriptor)
         expected = HEADER_BYTES + self._slots * self._slot_bytes
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
-            raise _refused(asked, "it must be a file of the user that the service runs as")
+            raise _refused(request, "it must be a file of the user that the service runs as")
         if status.st_size != expected:
-            raise _refused(asked, f"it must have {expected} bytes, got {status.st_size}")
-        if not hmac.compare_digest(os.pread(self._descriptor, TOKEN_BYTES, 0), asked.token):
-            raise _refused(asked, "it does not begin with the token")
+            raise _refused(request, f"it must have {expected} bytes, got {status.st_size}")
+        if not hmac.compare_digest(os.pread(self._descriptor, TOKEN_BYTES, 0), request.token):
+            raise _refused(request, "it does not begin with the token")
 
     def lend(self, size: int) -> Place | None:
         """The first slot that is free, with memory for so many bytes; None where there is no room."""
@@ -96,40 +96,40 @@ class SharedMemory:
         os.close(descriptor)
 
 
-def _connected(asked: rendering_pb2.SharedMemory, path: str) -> socket.socket:
+def _connected(request: rendering_pb2.SharedMemory, path: str) -> socket.socket:
     """The service's end of the client's socket. Raises InvalidArgument."""
     try:
         end = socket.socket(socket.AF_UNIX)
     except OSError as error:
-        raise _refused(asked, f"the service has no socket for it: {error.strerror}") from None
+        raise _refused(request, f"the service has no socket for it: {error.strerror}") from None
     try:
         end.setblocking(False)
         end.connect(path)
         _, user, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     except OSError as error:
         end.close()
-        raise _refused(asked, f"the service cannot connect to its socket: {error.strerror}") from None
+        raise _refused(request, f"the service cannot connect to its socket: {error.strerror}") from None
     if user != os.geteuid():
         end.close()
-        raise _refused(asked, "its socket must be one of the user that the service runs as")
+        raise _refused(request, "its socket must be one of the user that the service runs as")
     with suppress(OSError):
         os.unlink(path)
     return end
 
 
-def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:
-    slot_bytes = asked.slot_bytes
-    fits = 0 < slot_bytes <= MAX_SLOT_BYTES and asked.slots * slot_bytes <= MAX_BYTES and slot_bytes % PAGE_BYTES == 0
+def _check_sizes(request: rendering_pb2.SharedMemory) -> None:
+    slot_bytes = request.slot_bytes
+    fits = 0 < slot_bytes <= MAX_SLOT_BYTES and request.slots * slot_bytes <= MAX_BYTES and slot_bytes % PAGE_BYTES == 0
     whole = f"at most {MAX_SLOT_BYTES}, and at most {MAX_BYTES} for all slots together"
-    for part, is_right, expected, given in (
-        ("name", _NAME.fullmatch(asked.name), "be ultragray- and 32 hexadecimal digits", repr(asked.name)),
-        ("token", len(asked.token) == TOKEN_BYTES, f"have {TOKEN_BYTES} bytes", len(asked.token)),
-        ("slots", 1 <= asked.slots <= MAX_SLOTS, f"be from 1 to {MAX_SLOTS}", asked.slots),
+    for part, is_right, expected, value in (
+        ("name", _NAME.fullmatch(request.name), "be ultragray- and 32 hexadecimal digits", repr(request.name)),
+        ("token", len(request.token) == TOKEN_BYTES, f"have {TOKEN_BYTES} bytes", len(request.token)),
+        ("slots", 1 <= request.slots <= MAX_SLOTS, f"be from 1 to {MAX_SLOTS}", request.slots),
         ("slot_bytes", fits, f"be a multiple of {PAGE_BYTES}, {whole}", slot_bytes),
     ):
         if not is_right:
-            raise InvalidArgument(f"{_FIELD}.{part} must {expected}, got {given}", field=f"{_FIELD}.{part}")
+            raise InvalidArgument(f"{_FIELD}.{part} must {expected}, got {value}", field=f"{_FIELD}.{part}")
 
 
-def _refused(asked: rendering_pb2.SharedMemory, why: str) -> InvalidArgument:
-    return InvalidArgument(f"{_FIELD} {FOLDER}/{asked.name} is refused: {why}", field=f"{_FIELD}.name")
+def _refused(request: rendering_pb2.SharedMemory, why: str) -> InvalidArgument:
+    return InvalidArgument(f"{_FIELD} {FOLDER}/{request.name} is refused: {why}", field=f"{_FIELD}.name")

@@ -68,10 +68,10 @@ class _Step:
         if self.final is not None:
             return self.final
         ordered = {stage: sorted(samples) for stage, samples in self.samples.items()}
-        found = _quantile(ordered, 0.5), _quantile(ordered, 0.99)
+        quantiles = _quantile(ordered, 0.5), _quantile(ordered, 0.99)
         if ended:
-            self.final, self.samples = found, {}
-        return found
+            self.final, self.samples = quantiles, {}
+        return quantiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +128,8 @@ class Statistics:
     def summaries(self) -> list[StatisticsStep]:
         """The steps of the last minutes, the oldest first; one for each, also where nothing happened."""
         now = self._step_number()
-        found = {step.start: step for step in self._steps}
-        return [(found.get(now - age) or _Step(now - age)).summary(age) for age in range(STEPS - 1, -1, -1)]
+        steps = {step.start: step for step in self._steps}
+        return [(steps.get(now - age) or _Step(now - age)).summary(age) for age in range(STEPS - 1, -1, -1)]
 
     def _now(self) -> _Step:
         number = self._step_number()

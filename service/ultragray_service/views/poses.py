@@ -98,13 +98,13 @@ class Located:
 
     @classmethod
     def of(cls, result: SearchResult[Localization], plan: Plan) -> Located:
-        found = result.found
-        in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
+        match = result.found
+        in_base = None if plan.registration is None else plan.registration.flange_to_base(match.pose)
         return made_of(
             cls,
-            found,
+            match,
             result,
-            pose=found.pose.tolist(),
+            pose=match.pose.tolist(),
             flange_to_base=None if in_base is None else in_base.tolist(),
             registration=plan.settings.registration,
             queue_ms=round(result.queue_ms, 3),
@@ -170,10 +170,10 @@ async def _searched(
     await rendering.limits.take_frames(frames, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         what, start = search(plan)
-        asked = RenderRequest(plan.scene, what, start[None], Priority.BATCH, deadline, plan.version, caller())
+        request = RenderRequest(plan.scene, what, start[None], Priority.BATCH, deadline, plan.version, caller())
         try:
             with scene_to_blame():
-                result = await rendering.pool.search(asked)
+                result = await rendering.pool.search(request)
         except SceneChangedError:
             await plan.renew()
         else:
@@ -211,7 +211,7 @@ class Planned:
 
     @classmethod
     def of(cls, result: SearchResult[ViewPlan], plan: Plan) -> Planned:
-        found, registration = result.found, plan.registration
+        outcome, registration = result.found, plan.registration
         views = [
             PlannedView(
                 pose=pose.tolist(),
@@ -219,11 +219,11 @@ class Planned:
                 gain=gain,
                 rank=rank,
             )
-            for pose, gain, rank in zip(found.poses, found.gains.tolist(), found.ranks.tolist(), strict=True)
+            for pose, gain, rank in zip(outcome.poses, outcome.gains.tolist(), outcome.ranks.tolist(), strict=True)
         ]
         return made_of(
             cls,
-            found,
+            outcome,
             result,
             views=views,
             registration=plan.settings.registration,

@@ -40,7 +40,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(scene_file, tmp_path, mon
 
 
 def test_where_there_is_no_terminal_progress_is_told_in_lines(scene_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(terminal, "_TOLD_EVERY_S", 0.0)
+    monkeypatch.setattr(terminal, "_REPORT_EVERY_S", 0.0)
     done = run("render", scene_file, "-o", tmp_path / "f.npz", "--sampler", "around", "--count", 3)
     assert "rendering: 3 of 3, 0.0 min left" in done.stderr
 

@@ -399,7 +399,7 @@ class FakeTurn:
 
 
 def waits_in_the_pool(underway):
-    underway.asked, underway.setup = (turn := FakeTurn()), SETUP
+    underway.pending, underway.setup = (turn := FakeTurn()), SETUP
     return turn
 
 

@@ -53,14 +53,14 @@ def back_up(folders: Folders, database_url: str | None, backup_folder: Path, *, 
     with alone_in(backup_folder):
         objects = Objects(backup_folder)
         objects.remove_leftovers()
-        made = _Backup(folders, Database(folders.artifacts, database_url), objects, _known(backup_folder))
-        manifest = made.make(backup_folder)
+        backup = _Backup(folders, Database(folders.artifacts, database_url), objects, _known(backup_folder))
+        manifest = backup.make(backup_folder)
         manifests.write(backup_folder, manifest)
         old = [] if keep is None else manifests.names(backup_folder)[:-keep]
         for name in old:
             manifests.remove(backup_folder, name)
         removed_bytes = _remove_unused(backup_folder, objects) if old else 0
-    return Report(manifest, made.new_files, made.new_bytes, len(old), removed_bytes)
+    return Report(manifest, backup.new_files, backup.new_bytes, len(old), removed_bytes)
 
 
 def verify(backup_folder: Path) -> Iterator[tuple[Manifest, list[str]]]:
@@ -97,13 +97,13 @@ class _Backup:
         self._copy_files()
         with tempfile.TemporaryDirectory(dir=backup_folder, prefix=".work-") as work:
             snapshot = self._database.snapshot(self._objects, Path(work))
-        taken = {} if snapshot is None else dict(snapshot.states)
+        states = {} if snapshot is None else dict(snapshot.states)
         entries = self._copy_files()
-        now, entries = self._settled(taken, entries)
-        deleted = taken.keys() - now.keys()
-        kept = taken.keys() - deleted
-        files = tuple(entry for entry in entries if (job := job_id_of(entry.root, entry.path)) is None or job in kept)
-        waiting = {job for job in kept if not taken[job].is_final}
+        now, entries = self._settled(states, entries)
+        deleted = states.keys() - now.keys()
+        ids = states.keys() - deleted
+        files = tuple(entry for entry in entries if (job := job_id_of(entry.root, entry.path)) is None or job in ids)
+        waiting = {job for job in ids if not states[job].is_final}
         return Manifest(
             name=name,
             release=ultragray.__version__,
@@ -111,18 +111,18 @@ class _Backup:
             database=None if snapshot is None else snapshot.entry,
             deleted_jobs=tuple(sorted(deleted)),
             cancelled_jobs=tuple(sorted(job for job in waiting if now[job] is JobState.CANCELLED)),
-            counts=_counts(files, kept, waiting),
+            counts=_counts(files, ids, waiting),
         )
 
     def _settled(
-        self, taken: Mapping[str, JobState], entries: list[FileEntry]
+        self, states: Mapping[str, JobState], entries: list[FileEntry]
     ) -> tuple[Mapping[str, JobState], list[FileEntry]]:
         """The jobs as they are after the files were copied, and the files, when no job is half deleted."""
         end = time.monotonic() + _SETTLE_S
         while True:
             now = self._database.states()
-            found = {job_id_of(entry.root, entry.path) for entry in entries}
-            lost = [job for job in now if taken.get(job) is JobState.SUCCEEDED and job not in found]
+            ids = {job_id_of(entry.root, entry.path) for entry in entries}
+            lost = [job for job in now if states.get(job) is JobState.SUCCEEDED and job not in ids]
             if not lost or time.monotonic() > end:  # its folder was lost otherwise, which a backup does not mend
                 return now, entries
             time.sleep(_SETTLE_POLL_S)

@@ -59,8 +59,8 @@ def files_of(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
 
     `database`: a SQLite file, which with its companions is copied otherwise.
     """
-    found = list(_files(folders, database))
-    yield from sorted(found, key=lambda file: (file.grows, file.root, file.path))
+    files = list(_files(folders, database))
+    yield from sorted(files, key=lambda file: (file.grows, file.root, file.path))
 
 
 def _files(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
@@ -71,8 +71,8 @@ def _files(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
         yield from (StoredFile(root, below / name, scenes / name) for name in names if (scenes / name).is_file())
     # The files of a dataset are there before its manifest, and a recording is there before its blocks.
     for folder in (RECORDINGS, BLOCKS, FILES, MANIFESTS, JOBS):
-        kept = _below(artifacts, PurePosixPath(folder))
-        yield from (file for file in kept if not any(map(_is_of_a_process, file.path.parts[1:])))
+        files = _below(artifacts, PurePosixPath(folder))
+        yield from (file for file in files if not any(map(_is_of_a_process, file.path.parts[1:])))
     for entry in _entries(artifacts):  # facts about the folder itself
         is_database = database is not None and entry.name.startswith(database.name)
         if entry.is_file() and not is_database and not _is_of_a_process(entry.name) and entry.name != MARKER:
@@ -143,13 +143,13 @@ class Objects:
                 incoming = Path(name)
                 try:
                     digest = hashlib.sha256()
-                    left = before.size
+                    rest_bytes = before.size
                     with os.fdopen(descriptor, "wb") as copy:
-                        while left and (block := file.read(min(_BLOCK_BYTES, left))):
+                        while rest_bytes and (block := file.read(min(_BLOCK_BYTES, rest_bytes))):
                             digest.update(block)
                             copy.write(block)
-                            left -= len(block)
-                    if not left and (grows or FileVersion.of(file.fileno()) == before):
+                            rest_bytes -= len(block)
+                    if not rest_bytes and (grows or FileVersion.of(file.fileno()) == before):
                         return self._keep(incoming, digest.hexdigest(), before)
                 finally:
                     incoming.unlink(missing_ok=True)

@@ -43,10 +43,10 @@ def copy_scenes(source: Storage, target: Storage, say: Callable[[str], None] = l
             sha256 = file_sha256(file)
             is_new = target.entry(key) is None and target.upload(file, key, if_absent=True)
             with _file(target, key) as copy:
-                found = file_sha256(copy)
-            if found != sha256 and is_new:
+                digest = file_sha256(copy)
+            if digest != sha256 and is_new:
                 raise StorageUnavailable(f"the copy of {key} in {target.location} has another SHA-256: copy again")
-            if found != sha256:
+            if digest != sha256:
                 raise RestoreRefused(f"{target.location} has another {key}: remove it there, or choose another place")
             copied, there = copied + is_new, there + (not is_new)
             bytes_ += file.stat().st_size if is_new else 0
@@ -96,8 +96,8 @@ def copy_datasets(
                 continue
             with here.files(name) as folder:
                 is_new = there.manifest(name) is None and there.put(folder, manifest, name)
-            found = there.manifest(name)
-            if not is_new and (found is None or without_files(found) != without_files(manifest)):
+            copy = there.manifest(name)
+            if not is_new and (copy is None or without_files(copy) != without_files(manifest)):
                 raise RestoreRefused(
                     f"{target.location} has another dataset {name!r}: delete it there, or choose another place"
                 )

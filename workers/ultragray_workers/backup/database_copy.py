@@ -160,8 +160,8 @@ def _connected(url: sa.URL, *, is_patient: bool = False, at_one_moment: bool = F
 
 
 def _states(connection: sa.Connection) -> dict[str, JobState]:
-    found = connection.execute(sa.select(JOBS.c.id, JOBS.c.state).where(JOBS.c.batch.is_(None)))
-    return {job_id: JobState(state) for job_id, state in found}
+    rows = connection.execute(sa.select(JOBS.c.id, JOBS.c.state).where(JOBS.c.batch.is_(None)))
+    return {job_id: JobState(state) for job_id, state in rows}
 
 
 def _counted(states: Mapping[str, JobState]) -> dict[str, int]:

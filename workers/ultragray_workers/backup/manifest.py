@@ -80,8 +80,8 @@ class Manifest:
     def _database_objects(self) -> dict[str, int]:
         if self.database is None:
             return {}
-        found = {table.sha256: table.bytes for table in self.database.tables}
-        return found if self.database.sha256 is None else {**found, self.database.sha256: self.database.bytes}
+        objects = {table.sha256: table.bytes for table in self.database.tables}
+        return objects if self.database.sha256 is None else {**objects, self.database.sha256: self.database.bytes}
 
 
 def names(backup_folder: Path) -> list[str]:
@@ -104,21 +104,21 @@ def remove(backup_folder: Path, name: str) -> None:
 
 def read(backup_folder: Path, name: str | None) -> Manifest:
     """A backup of a folder, or the newest. Raises BackupInvalid where there is none, or where it cannot be used."""
-    found = names(backup_folder)
-    if not found:
+    backups = names(backup_folder)
+    if not backups:
         raise BackupInvalid(f"{backup_folder} holds no backup")
-    if name is not None and name not in found:
-        raise BackupInvalid(f"{backup_folder} holds no backup {name!r}, it holds {', '.join(found)}")
-    path = _path(backup_folder, name or found[-1])
+    if name is not None and name not in backups:
+        raise BackupInvalid(f"{backup_folder} holds no backup {name!r}, it holds {', '.join(backups)}")
+    path = _path(backup_folder, name or backups[-1])
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        told, version = document.pop("sha256"), document["format_version"]
+        digest, version = document.pop("sha256"), document["format_version"]
         if version != FORMAT_VERSION:
             raise BackupInvalid(
                 f"{path} has version {version} of the format of backups, and this release reads version "
                 f"{FORMAT_VERSION}: restore it with release {document['release']}"
             )
-        if told != _sha256(document):
+        if digest != _sha256(document):
             raise ValueError("it does not have its own hash")
         if document["name"] != path.stem:
             raise ValueError(f"it calls itself {document['name']!r}")
@@ -138,8 +138,8 @@ def _manifest_of(document: dict[str, Any]) -> Manifest:
     for root, path in paths:
         if any((root, parent) in paths for parent in path.parents):
             raise ValueError(f"it names the file {root} {str(path)!r} below another file")
-    made = Manifest(**values)
-    return replace(made, deleted_jobs=tuple(made.deleted_jobs), cancelled_jobs=tuple(made.cancelled_jobs))
+    manifest = Manifest(**values)
+    return replace(manifest, deleted_jobs=tuple(manifest.deleted_jobs), cancelled_jobs=tuple(manifest.cancelled_jobs))
 
 
 def _file_entry(document: dict[str, Any]) -> FileEntry:

@@ -119,9 +119,9 @@ def _require_empty(folders: Folders, database: Database) -> None:
 
 
 def _remove_others(manifest: Manifest, folders: Folders, database: Database) -> None:
-    kept = {(entry.root, entry.path) for entry in manifest.files}
+    paths = {(entry.root, entry.path) for entry in manifest.files}
     for file in list(files_of(folders, database.sqlite)):
-        if (file.root, str(file.path)) not in kept:
+        if (file.root, str(file.path)) not in paths:
             file.source.unlink(missing_ok=True)
 
 

@@ -69,8 +69,8 @@ class RayBatch:
             try:
                 while True:
                     for shard in islice(missing, _AT_ONCE - len(waiting)):
-                        told = (shard, self.location, self.backend, self.threads, ultragray.__version__)
-                        waiting[task.remote(*shared, *told)] = shard
+                        arguments = (shard, self.location, self.backend, self.threads, ultragray.__version__)
+                        waiting[task.remote(*shared, *arguments)] = shard
                     if not waiting:
                         break
                     ready, _ = ray.wait(list(waiting))
@@ -84,8 +84,8 @@ class RayBatch:
             ray.shutdown()
         place.finish()
         if (making := place.storage.in_place(_MAKING)) is not None:
-            for left in making.parent.glob(f"{_MAKING}*"):  # by workers that died
-                shutil.rmtree(left, ignore_errors=True)
+            for leftover in making.parent.glob(f"{_MAKING}*"):  # by workers that died
+                shutil.rmtree(leftover, ignore_errors=True)
 
 
 def check_address(address: str) -> None:
@@ -128,7 +128,7 @@ def _result(ray: Any, reference: Any, shard: int) -> int:
 
 # In a worker of the cluster.
 
-_held: tuple[str, ShardRenderer] | None = None  # of the last shard, by what it was made for
+_last_renderer: tuple[str, ShardRenderer] | None = None  # of the last shard, by what it was made for
 
 
 def _make_shard(
@@ -157,15 +157,15 @@ def _make_shard(
 
 
 def _renderer(plan: BatchPlan, scene: bytes, backend: str) -> ShardRenderer:
-    global _held
+    global _last_renderer
     from ultragray.exchange.shards import ShardRenderer
     from ultragray.rendering.backends.registry import render_device
 
     wanted = f"{plan.identity} {backend}"
-    if _held is None or _held[0] != wanted:
-        _held = None  # the old scene goes first
+    if _last_renderer is None or _last_renderer[0] != wanted:
+        _last_renderer = None  # the old scene goes first
         with tempfile.NamedTemporaryFile(suffix=".ugr") as file:
             file.write(scene)
             file.flush()
-            _held = wanted, ShardRenderer(plan, Path(file.name), render_device(backend), backend=backend)
-    return _held[1]
+            _last_renderer = wanted, ShardRenderer(plan, Path(file.name), render_device(backend), backend=backend)
+    return _last_renderer[1]

@@ -51,18 +51,18 @@ class ShardPlace:
     def whole(self) -> list[int]:
         """The shards that are there whole, by what lies in the place: those that need not be made."""
         known = {entry.key for entry in self.storage.entries(self.key(_ENTRIES))}
-        asked = [shard for shard in range(self.plan.shard_count) if self._entry_key(shard) in known]
+        shards = [shard for shard in range(self.plan.shard_count) if self._entry_key(shard) in known]
         with ThreadPoolExecutor(_AT_ONCE) as threads:
-            return [shard for shard, entry in zip(asked, threads.map(self.entry, asked), strict=True) if entry]
+            return [shard for shard, entry in zip(shards, threads.map(self.entry, shards), strict=True) if entry]
 
     def is_finished(self) -> bool:
         try:
-            found = json.loads(self.storage.read(self.key(MANIFEST_FILE)))
+            manifest = json.loads(self.storage.read(self.key(MANIFEST_FILE)))
         except NotThere:
             return False
         except ValueError:
-            found = None
-        if not isinstance(found, dict) or found.get("plan") != self.plan.identity:
+            manifest = None
+        if not isinstance(manifest, dict) or manifest.get("plan") != self.plan.identity:
             raise InvalidArgument(
                 f"{self.storage.location} has the {MANIFEST_FILE} of another batch: choose another place",
                 field="output",
@@ -93,8 +93,8 @@ class ShardPlace:
 
     def _is_whole(self, entry: ShardEntry) -> bool:
         """By its size in a bucket, whose objects are whole or absent; by its hash in a folder."""
-        found = self.storage.entry(self.key(entry.file))
-        if found is None or found.bytes != entry.bytes:
+        item = self.storage.entry(self.key(entry.file))
+        if item is None or item.bytes != entry.bytes:
             return False
         path = self.storage.in_place(self.key(entry.file))
         return path is None or file_sha256(path) == entry.sha256

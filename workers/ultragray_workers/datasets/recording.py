@@ -125,8 +125,8 @@ class Recordings:
 
     def begin(self, name: str, settings: RecordingSettings) -> None:
         """Begins a recording; nothing where there is one with these settings. Raises DatasetExists for others."""
-        made = _Header(secrets.token_hex(16), datetime.now(timezone.utc).isoformat(timespec="seconds"), settings)
-        document = {"format_version": FORMAT_VERSION, **asdict(made), "settings": to_dict(settings)}
+        header = _Header(secrets.token_hex(16), datetime.now(timezone.utc).isoformat(timespec="seconds"), settings)
+        document = {"format_version": FORMAT_VERSION, **asdict(header), "settings": to_dict(settings)}
         if self.storage.write(_key(name), (json.dumps(document, indent=1) + "\n").encode(), if_absent=True):
             return
         if self._header(name).settings != settings:
@@ -191,8 +191,8 @@ class RecordingWriter:
         while sizes:
             last = max(sizes)
             data = storage.read(last)
-            if (found := _unpack(data, header.settings)) is not None:
-                frames, next_number = _document(data)["before"] + len(found), found[-1].number + 1
+            if (block_frames := _unpack(data, header.settings)) is not None:
+                frames, next_number = _document(data)["before"] + len(block_frames), block_frames[-1].number + 1
                 break
             storage.delete(last)
             del sizes[last]
@@ -210,8 +210,8 @@ class RecordingWriter:
         if block < 0:
             return False
         if self._looked_into is None or self._looked_into[0] != block:
-            found = _unpack(self._storage.read(_block_key(self._header, block)), self._header.settings)
-            self._looked_into = block, found or []
+            frames = _unpack(self._storage.read(_block_key(self._header, block)), self._header.settings)
+            self._looked_into = block, frames or []
         return any(
             one.number == frame.number
             and np.array_equal(one.pose, frame.pose)
@@ -241,8 +241,8 @@ class RecordingWriter:
 
     def _first_number(self, block: int) -> int:
         if block not in self._first_numbers:
-            told = _document(self._storage.read(_block_key(self._header, block)))
-            self._first_numbers[block] = told["frames"][0]["number"]
+            document = _document(self._storage.read(_block_key(self._header, block)))
+            self._first_numbers[block] = document["frames"][0]["number"]
         return self._first_numbers[block]
 
 
@@ -297,8 +297,8 @@ def _block_key(header: _Header, number: int) -> str:
 
 def _pack(writer: str, before: int, frames: Sequence[RecordedFrame]) -> bytes:
     """A block: the length of its JSON, the JSON, the pixels of its frames."""
-    told = [{"number": one.number, "time_s": one.time_s, "pose": one.pose.ravel().tolist()} for one in frames]
-    head = json.dumps({"writer": writer, "before": before, "frames": told}).encode()
+    entries = [{"number": one.number, "time_s": one.time_s, "pose": one.pose.ravel().tolist()} for one in frames]
+    head = json.dumps({"writer": writer, "before": before, "frames": entries}).encode()
     return len(head).to_bytes(_LENGTH_BYTES, "little") + head + b"".join(one.pixels.tobytes() for one in frames)
 
 
@@ -312,15 +312,15 @@ def _document(data: bytes) -> dict[str, Any]:
 def _unpack(data: bytes, settings: RecordingSettings) -> list[RecordedFrame] | None:
     """The frames of a block; None where it is cut off."""
     try:
-        told = _document(data)["frames"]
+        entries = _document(data)["frames"]
     except ValueError:
         return None
-    shape = len(told), settings.image_height, settings.image_width
+    shape = len(entries), settings.image_height, settings.image_width
     start = _LENGTH_BYTES + int.from_bytes(data[:_LENGTH_BYTES], "little")
     if len(data) - start != shape[0] * shape[1] * shape[2]:
         return None
     pixels = np.frombuffer(data, np.uint8, offset=start).reshape(shape)
     return [
         RecordedFrame(one["number"], one["time_s"], np.array(one["pose"]).reshape(4, 4), image)
-        for one, image in zip(told, pixels, strict=True)
+        for one, image in zip(entries, pixels, strict=True)
     ]

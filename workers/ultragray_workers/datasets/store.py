@@ -99,14 +99,14 @@ class StoredFiles:
 
     @classmethod
     def of(cls, manifest: str) -> StoredFiles:
-        """Those that a manifest names. Raises DatasetInvalid."""
+        """The files that a manifest names. Raises DatasetInvalid."""
         try:
-            found = cls(**json.loads(manifest)[_STORED])
+            files = cls(**json.loads(manifest)[_STORED])
         except (ValueError, KeyError, TypeError):
             raise DatasetInvalid("the manifest of the dataset does not name the files of the dataset") from None
-        if any(PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts for path in found.sha256):
+        if any(PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts for path in files.sha256):
             raise DatasetInvalid("the manifest of the dataset names files outside of the dataset")
-        return found
+        return files
 
 
 class DatasetStore:
@@ -137,8 +137,8 @@ class DatasetStore:
 
     def names(self) -> list[str]:
         """The names of all data sets, sorted."""
-        found = ((PurePosixPath(entry.key), entry) for entry in self.storage.entries_in(MANIFESTS))
-        entries = {path.stem: entry for path, entry in found if path.suffix == ".json" and _NAME.fullmatch(path.stem)}
+        paths = ((PurePosixPath(entry.key), entry) for entry in self.storage.entries_in(MANIFESTS))
+        entries = {path.stem: entry for path, entry in paths if path.suffix == ".json" and _NAME.fullmatch(path.stem)}
         with self._knowing:
             self._listed, self._listed_at_s = entries, time.monotonic()
         return sorted(entries)
@@ -148,11 +148,11 @@ class DatasetStore:
 
     def names_by_content(self) -> dict[str, str]:
         """The name of a data set by its SHA-256; those whose manifest is damaged are left out."""
-        found: dict[str, str] = {}
+        names: dict[str, str] = {}
         for name in self.names():
             with contextlib.suppress(UltragrayError):
-                found.setdefault(self.get(name).sha256, name)
-        return found
+                names.setdefault(self.get(name).sha256, name)
+        return names
 
     def get(self, name: str) -> DatasetRecord:
         """Raises DatasetNotFound, also for a name that no data set can have; DatasetInvalid for a damaged manifest."""
@@ -160,7 +160,7 @@ class DatasetStore:
         return self._read(name)
 
     def bytes_of(self, name: str) -> int:
-        """Of a data set, or of a recording that becomes one. Raises DatasetNotFound, DatasetInvalid."""
+        """The size of a data set, or of a recording that becomes one. Raises DatasetNotFound, DatasetInvalid."""
         return self.recordings.state(name).bytes if self.recordings.is_open(name) else self.get(name).bytes
 
     def load(self, name: str) -> Dataset:
@@ -210,9 +210,9 @@ class DatasetStore:
         """
         stored = self._files_of(name)
         with contextlib.ExitStack() as stack:
-            held = self.storage.held(stored.prefix, stored.sha256, self.folder, self._max_copies_bytes)
+            copy = self.storage.held(stored.prefix, stored.sha256, self.folder, self._max_copies_bytes)
             try:
-                folder = stack.enter_context(held)
+                folder = stack.enter_context(copy)
             except NotThere:
                 raise self._not_found(name) from None
             except Damaged as damaged:
@@ -241,9 +241,9 @@ class DatasetStore:
         """The data set `name`, where it has that content and those options. Raises DatasetExists for another."""
         if self.recordings.is_open(name):
             raise DatasetExists(f"the name {name!r} is that of a recording: choose another one", field="dataset")
-        present = self._read(name)
-        if (present.sha256, present.options) == (sha256, options) and not self.hides(name):
-            return present
+        record = self._read(name)
+        if (record.sha256, record.options) == (sha256, options) and not self.hides(name):
+            return record
         raise DatasetExists(
             f"there is already a dataset {name!r} with another content or other options: delete it first, or choose "
             "another name",
@@ -296,18 +296,18 @@ class DatasetStore:
         return self._remove_strays(FILES, self._uploads) + self._remove_strays(BLOCKS, self.recordings.ids)
 
     def _uploads(self) -> set[str]:
-        named = set()
+        uploads = set()
         for name in self.names():
             with contextlib.suppress(DatasetInvalid, DatasetNotFound):
-                named.add(self._files_of(name).upload)
-        return named
+                uploads.add(self._files_of(name).upload)
+        return uploads
 
-    def _remove_strays(self, prefix: str, named: Callable[[], set[str]]) -> int:
+    def _remove_strays(self, prefix: str, known_uploads: Callable[[], set[str]]) -> int:
         old: dict[str, list[Entry]] = {}
         for entry in self.storage.entries(prefix):
             if time.time() - entry.modified > _STRAY_AFTER_S:
                 old.setdefault(entry.key.split("/")[1], []).append(entry)
-        known = named() if old else set()
+        known = known_uploads() if old else set()
         strays = {upload: entries for upload, entries in old.items() if upload not in known}
         for upload in strays:
             self.storage.delete_all(f"{prefix}/{upload}")
@@ -360,8 +360,8 @@ def check_dataset_name(name: str) -> None:
 
 
 def write_manifest(record: DatasetRecord, folder: Path) -> None:
-    kept = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
-    document = {"format_version": FORMAT_VERSION, **kept}
+    values = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
+    document = {"format_version": FORMAT_VERSION, **values}
     write_whole(folder / MANIFEST_NAME, json.dumps(document, indent=1) + "\n")
 
 

@@ -108,8 +108,8 @@ def unpack(archive: Path, folder: Path, max_bytes: int) -> None:
 
 
 def _unpack_zip(archive: Path, folder: Path, budget: FileBudget) -> None:
-    with zipfile.ZipFile(archive) as opened:
-        for entry in _counted(iter(opened.infolist())):
+    with zipfile.ZipFile(archive) as zip_file:
+        for entry in _counted(iter(zip_file.infolist())):
             kind = stat.S_IFMT(entry.external_attr >> 16)
             if entry.is_dir():
                 continue
@@ -117,15 +117,15 @@ def _unpack_zip(archive: Path, folder: Path, budget: FileBudget) -> None:
                 raise _not_plain(entry.filename)
             if entry.flag_bits & 1:
                 raise DatasetInvalid(f"the archive is encrypted: {entry.filename[:200]!a}")
-            _copy(entry.filename, opened.open(entry), folder, budget)
+            _copy(entry.filename, zip_file.open(entry), folder, budget)
 
 
 def _unpack_tar(archive: Path, mode: str, folder: Path, budget: FileBudget) -> None:
-    with tarfile.open(archive, mode) as opened:  # type: ignore[call-overload]  # mypy wants a literal
-        for entry in _counted(iter(opened)):
+    with tarfile.open(archive, mode) as tar_file:  # type: ignore[call-overload]  # mypy wants a literal
+        for entry in _counted(iter(tar_file)):
             if entry.isdir():
                 continue
-            content = opened.extractfile(entry) if entry.isreg() else None
+            content = tar_file.extractfile(entry) if entry.isreg() else None
             if content is None:
                 raise _not_plain(entry.name)
             _copy(entry.name, content, folder, budget)

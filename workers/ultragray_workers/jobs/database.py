@@ -170,12 +170,12 @@ def _raise_as_ours(context: ExceptionContext) -> None:
 
 
 def _inode(file: str) -> tuple[int, int] | None:
-    """Of the file that stands at the path; None: there is none."""
+    """Device and inode of the file at a path; None: there is none."""
     try:
-        found = os.stat(file)
+        status = os.stat(file)
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 KEY = "folder_id"
@@ -211,7 +211,7 @@ class StoreIdentity:
             self._right_at_s = time.monotonic()
 
     def check_writable(self) -> None:
-        """As `check`, and raises ArtifactFolderUnavailable where nothing can be written."""
+        """Checks the identity, too. Raises ArtifactFolderUnavailable where nothing can be written."""
         self.check()
         key = f"{_PROBES}/{uuid.uuid4().hex}"
         try:

@@ -62,10 +62,10 @@ class JobFiles:
 
     def artifacts(self, job_id: str) -> dict[str, Artifact]:
         """The files to download, by name; of a batch with its shards."""
-        found = dict(self._files(job_id).artifacts)
+        files = dict(self._files(job_id).artifacts)
         for entry in self.storage.entries_in(batch_prefix(job_id)):
-            found[entry.key.rpartition("/")[2]] = _whole(entry)
-        return {name: Artifact(self.storage, name, stored) for name, stored in found.items()}
+            files[entry.key.rpartition("/")[2]] = _whole(entry)
+        return {name: Artifact(self.storage, name, stored) for name, stored in files.items()}
 
     def artifact(self, job_id: str, name: str) -> Artifact | None:
         """One file to download, of the name that it is known to have; None where it has gone."""
@@ -159,14 +159,14 @@ def carried_key(job_id: str, name: str) -> str:
 
 
 def _read_pieces(storage: Storage, pieces: Sequence[Piece], start: int, length: int) -> bytes:
-    found, begin, end = [], 0, start + length
+    chunks, begin, end = [], 0, start + length
     for piece in pieces:
         first, last = max(start, begin), min(end, begin + piece.bytes)
         if first < last:
             with contextlib.suppress(NotThere):  # the job was deleted meanwhile
-                found.append(storage.read(piece.key, start=first - begin, length=last - first))
+                chunks.append(storage.read(piece.key, start=first - begin, length=last - first))
         begin += piece.bytes
-    return b"".join(found)
+    return b"".join(chunks)
 
 
 def _whole(entry: Entry) -> StoredFile:

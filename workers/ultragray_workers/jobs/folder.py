@@ -74,8 +74,8 @@ class JobFolder:
         return int(self.path.name.rpartition(".")[2])
 
     def others(self) -> list[JobFolder]:
-        found = self.path.parent.glob(f"{self.job_id}.*")
-        attempts = [int(path.suffix[1:]) for path in found if path.suffix[1:].isdigit() and path != self.path]
+        paths = self.path.parent.glob(f"{self.job_id}.*")
+        attempts = [int(path.suffix[1:]) for path in paths if path.suffix[1:].isdigit() and path != self.path]
         return [JobFolder(self.artifact_folder, self.job_id, attempt) for attempt in attempts]
 
     def make(self) -> None:

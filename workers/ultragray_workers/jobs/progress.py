@@ -123,8 +123,8 @@ def to_json(value: Any) -> str:
 def from_json(kind: type[_T], text: str | bytes) -> _T:
     """Inverse of `to_json`; what is left out keeps its default. Raises ValueError."""
     reader: Any = kind  # mypy takes no class for what a cache can hold
-    found: _T = _adapter(reader).validate_python(json.loads(text))
-    return found
+    value: _T = _adapter(reader).validate_python(json.loads(text))
+    return value
 
 
 @cache

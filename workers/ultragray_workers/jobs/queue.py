@@ -48,8 +48,8 @@ def submit(engine: sa.Engine, values: dict[str, Any], also: Callable[[sa.Connect
     try:
         with engine.begin() as connection:
             inserted = insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
-            made = inserted.on_conflict_do_nothing(index_elements=["id"]).returning(JOBS.c.number)
-            if connection.execute(made).first() is None:
+            statement = inserted.on_conflict_do_nothing(index_elements=["id"]).returning(JOBS.c.number)
+            if connection.execute(statement).first() is None:
                 return False
             also(connection)
     except IntegrityError as error:
@@ -85,24 +85,24 @@ def take(engine: sa.Engine, worker: str, demands: Sequence[str]) -> Row | None:
             number = connection.execute(following).scalar()
             if number is None:
                 return None
-            taken = (
+            statement = (
                 sa.update(JOBS)
                 .where(JOBS.c.number == number, JOBS.c.state == _QUEUED)
                 .values(state=_RUNNING, worker=worker, attempt=JOBS.c.attempt + 1, started_ms=_now_ms())
                 .returning(*COLUMNS)
             )
-            row = connection.execute(taken).one_or_none()
+            row = connection.execute(statement).one_or_none()
         if row is not None:
             return Row.of(row)
 
 
-def put_back(engine: sa.Engine, held: Row, *, is_untouched: bool = False) -> bool:
-    """Lets a job wait again; False where it is not the attempt of `held` any more.
+def put_back(engine: sa.Engine, row: Row, *, is_untouched: bool = False) -> bool:
+    """Lets a job wait again; False where it is not the attempt of `row` any more.
 
     `is_untouched`: nothing was done, and the attempt is not counted.
     """
     attempt = JOBS.c.attempt - (1 if is_untouched else 0)
-    return _change(engine, held, state=_QUEUED, attempt=attempt)
+    return _change(engine, row, state=_QUEUED, attempt=attempt)
 
 
 def put_back_of_dead(engine: sa.Engine) -> list[str]:
@@ -125,32 +125,32 @@ def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]
         return list(connection.execute(changed).scalars())
 
 
-def is_held(engine: sa.Engine, held: Row) -> bool:
-    return bool(read(engine, sa.select(JOBS.c.number).where(*_holds(held))))
+def is_held(engine: sa.Engine, row: Row) -> bool:
+    return bool(read(engine, sa.select(JOBS.c.number).where(*_holds(row))))
 
 
-def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) -> bool:
+def tell(engine: sa.Engine, row: Row, progress: Progress | None, files: Files) -> bool:
     """Says how far a job is and what there is of it, also of one that was just cancelled: a retry goes on there.
 
-    False where it is not the attempt of `held` any more.
+    False where it is not the attempt of `row` any more.
     """
-    is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
-    told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
-    return write(engine, told.values(progress=progress, files=files))
+    is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == row.worker
+    statement = sa.update(JOBS).where(JOBS.c.id == row.id, *is_its, JOBS.c.attempt == row.attempt)
+    return write(engine, statement.values(progress=progress, files=files))
 
 
-def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
+def publish(engine: sa.Engine, row: Row, outcome: Outcome, files: Files) -> bool:
     """Decides that the scene of a job is served: from now on it cannot be cancelled, and who takes it over serves it.
 
-    False where it was cancelled first, or is not the attempt of `held` any more.
+    False where it was cancelled first, or is not the attempt of `row` any more.
     """
-    return _change(engine, held, published=True, outcome=outcome, files=files)
+    return _change(engine, row, published=True, outcome=outcome, files=files)
 
 
-def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
+def finish(engine: sa.Engine, row: Row, outcome: Outcome, files: Files) -> bool:
     """Ends a job, which gives back the name of a scene that it did not make.
 
-    False where it is not the attempt of `held` any more.
+    False where it is not the attempt of `row` any more.
     """
     state = JobState.SUCCEEDED if outcome.error is None else JobState.FAILED
     ended = {
@@ -161,10 +161,10 @@ def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool
         "finished_ms": _now_ms(),
     }
     with engine.begin() as connection:
-        if not connection.execute(sa.update(JOBS).where(*_holds(held)).values(ended)).rowcount:
+        if not connection.execute(sa.update(JOBS).where(*_holds(row)).values(ended)).rowcount:
             return False
         if outcome.error is not None:
-            _give_name_back(connection, held)
+            _give_name_back(connection, row)
     return True
 
 
@@ -206,8 +206,8 @@ def row_of(engine: sa.Engine, job_id: str) -> Row | None:
 
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
-    ((found,),) = read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
-    return dict(found)
+    ((specification,),) = read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
+    return dict(specification)
 
 
 def page(
@@ -229,15 +229,15 @@ def page(
         chosen = chosen.where(JOBS.c.state == state.value)
     if kind is not None:
         chosen = chosen.where(JOBS.c.kind == kind)
-    found: list[Row] = []
-    while len(found) <= page_size:
+    jobs: list[Row] = []
+    while len(jobs) <= page_size:
         following = chosen if before is None else chosen.where(JOBS.c.number < before)
         rows = [Row.of(row) for row in read(engine, following)]
-        found += filter(shown, rows)
+        jobs += filter(shown, rows)
         if len(rows) <= page_size:
             break
         before = rows[-1].number
-    return found[:page_size], str(found[page_size - 1].number) if len(found) > page_size else None
+    return jobs[:page_size], str(jobs[page_size - 1].number) if len(jobs) > page_size else None
 
 
 def _read_token(token: str | None) -> int | None:
@@ -269,10 +269,10 @@ def _count(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> int:
 def demands_waiting(engine: sa.Engine) -> list[str]:
     """The keys of the demands that jobs which wait have: one step in an index for each, however many jobs there are."""
     waits, key = JOBS.c.state == _QUEUED, JOBS.c.demand
-    found = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
-    following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
-    found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
-    return [row.key for row in read(engine, sa.select(found.c.key).where(found.c.key.is_not(None)))]
+    keys = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
+    following = sa.select(sa.func.min(key)).where(waits, key > keys.c.key).scalar_subquery()
+    keys = keys.union_all(sa.select(following).where(keys.c.key.is_not(None)))
+    return [row.key for row in read(engine, sa.select(keys.c.key).where(keys.c.key.is_not(None)))]
 
 
 def waiting(engine: sa.Engine) -> list[tuple[Demand, int, int]]:
@@ -289,12 +289,12 @@ def find(engine: sa.Engine, *, needs_dataset: str | None = None, makes_scene: st
 
 
 def successor(engine: sa.Engine, job_id: str) -> str | None:
-    found = _job(engine, _IS_UNFINISHED, JOBS.c.retry_of == job_id)
-    return None if found is None else found.id
+    retry = _job(engine, _IS_UNFINISHED, JOBS.c.retry_of == job_id)
+    return None if retry is None else retry.id
 
 
 def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
-    """Those of the ids that are jobs or shares."""
+    """The ids among these that are jobs or shares."""
     return {row.id for row in read(engine, sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids)))}
 
 
@@ -342,15 +342,15 @@ def blame_shard(engine: sa.Engine, share: Row, outcome: Outcome) -> None:
         connection.execute(sa.update(SHARDS).where(*mine, SHARDS.c.number == number).values(values))
 
 
-def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> None:
+def add_run_time(engine: sa.Engine, row: Row, device: str, seconds: float) -> None:
     """Counts time that a job's process ran, for the job and for its owner."""
     key: dict[str, Any] = {
-        "owner": held.owner or "",
+        "owner": row.owner or "",
         "device": "cpu" if device == "cpu" else "gpu",
         "day": datetime.now(timezone.utc).date(),
     }
     with engine.begin() as connection:
-        of_job = sa.update(JOBS).where(JOBS.c.id == held.id).values(run_s=JOBS.c.run_s + seconds)
+        of_job = sa.update(JOBS).where(JOBS.c.id == row.id).values(run_s=JOBS.c.run_s + seconds)
         connection.execute(of_job)
         counted = insert(connection, USAGE).values(**key, run_s=seconds)
         more = {"run_s": USAGE.c.run_s + seconds}
@@ -371,8 +371,8 @@ def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
     return sa.cast(sa.func.extract("epoch", sa.func.clock_timestamp()), sa.Double)
 
 
-def _change(engine: sa.Engine, held: Row, **values: Any) -> bool:
-    return write(engine, sa.update(JOBS).where(*_holds(held)).values(values))
+def _change(engine: sa.Engine, row: Row, **values: Any) -> bool:
+    return write(engine, sa.update(JOBS).where(*_holds(row)).values(values))
 
 
 def _job(engine: sa.Engine, *conditions: sa.ColumnElement[bool]) -> Row | None:
@@ -380,8 +380,8 @@ def _job(engine: sa.Engine, *conditions: sa.ColumnElement[bool]) -> Row | None:
     return Row.of(rows[0]) if rows else None
 
 
-def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:
-    return JOBS.c.id == held.id, _is_run_by(held.worker), JOBS.c.attempt == held.attempt
+def _holds(row: Row) -> tuple[sa.ColumnElement[bool], ...]:
+    return JOBS.c.id == row.id, _is_run_by(row.worker), JOBS.c.attempt == row.attempt
 
 
 def _is_run_by(worker: str | None) -> sa.ColumnElement[bool]:

@@ -186,10 +186,10 @@ class JobStore:
         owner = whose.owner
         self.database.identity.check()
         text = json.dumps([_plain(to_dict(specification)), priority, whose.private], sort_keys=True)
-        asked = hashlib.sha256(text.encode()).hexdigest()  # the same request_id must ask for the same
+        digest = hashlib.sha256(text.encode()).hexdigest()  # the same request_id must ask for the same
         with self._submitting:
             if queue.row_of(self._engine, job_id) is not None:
-                return self._same(job_id, asked), False
+                return self._same(job_id, digest), False
             if queue.count_waiting(self._engine) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
@@ -197,7 +197,7 @@ class JobStore:
             used = self._provide(placed, job_id, retry_of)
             self._keep_carried(placed, carried_name(summary), job_id, retry_of)
             is_private = whose.private | self._are_private(used, owner, by)
-            made = value_in(summary, "makes_scene")
+            scene_name = value_in(summary, "makes_scene")
             trace: dict[str, str] = {}
             propagate.inject(trace)
             values = {
@@ -207,40 +207,40 @@ class JobStore:
                 "owner": owner,
                 "private": is_private,
                 "request_id": request_id,
-                "asked": asked,
+                "asked": digest,
                 "retry_of": retry_of,
                 "summary": summary,
                 "specification": to_dict(placed),
                 "dataset": value_in(summary, "needs_dataset"),
-                "makes_scene": made,
+                "makes_scene": scene_name,
                 "demand": Demand.of(summary).key,
                 "most_running": most_running,
                 "trace": trace,
             }
 
             def claim_scene(connection: sa.Connection) -> None:
-                if made is None or owner is None:
+                if scene_name is None or owner is None:
                     return
                 ownership = Ownership(owner, is_private, claim_of_job(job_id))
-                if not add_owner(connection, Kind.SCENE, made, ownership):
-                    holder = read_owner(connection, Kind.SCENE, made)
+                if not add_owner(connection, Kind.SCENE, scene_name, ownership):
+                    holder = read_owner(connection, Kind.SCENE, scene_name)
                     if retry_of is not None and holder == replace(ownership, claim=claim_of_job(retry_of)):
-                        forget_owner(connection, Kind.SCENE, made, holder)
-                        add_owner(connection, Kind.SCENE, made, ownership)
+                        forget_owner(connection, Kind.SCENE, scene_name, holder)
+                        add_owner(connection, Kind.SCENE, scene_name, ownership)
                         return
                     raise SceneExists(
-                        f"a scene {made!r} is being imported: choose another name",
+                        f"a scene {scene_name!r} is being imported: choose another name",
                         field=specification.makes_scene,
                     )
 
-            if made is not None:
-                self._forget_dead_claim(made)
+            if scene_name is not None:
+                self._forget_dead_claim(scene_name)
             try:
                 if not queue.submit(self._engine, values, claim_scene):  # another service was quicker
-                    return self._same(job_id, asked), False
+                    return self._same(job_id, digest), False
             except queue.SceneTaken:
                 raise SceneExists(
-                    f"another job that waits or runs makes the scene {made!r}: choose another name",
+                    f"another job that waits or runs makes the scene {scene_name!r}: choose another name",
                     field=specification.makes_scene,
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
@@ -271,23 +271,23 @@ class JobStore:
         `before`: the job that it replaces, whose scene is taken where it is still there. Returns the dataset and the
         scene that the job takes, but for a scene that the job before has kept.
         """
-        taken = []
+        inputs = []
         if (dataset := _named(specification, specification.needs_dataset)) is not None:
             self._require_dataset(specification, dataset)
-            taken.append((Kind.DATASET, dataset))
-        made = _named(specification, specification.makes_scene)
+            inputs.append((Kind.DATASET, dataset))
+        scene_name = _named(specification, specification.makes_scene)
         goes_on = before is not None and specification.serves_versions  # with the scene that it has served already
-        if made is not None and not goes_on and made in self._scenes.names():
+        if scene_name is not None and not goes_on and scene_name in self._scenes.names():
             raise SceneExists(
-                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
+                f"there is already a scene {scene_name!r}: choose another name", field=specification.makes_scene
             )
         free_bytes, name = self._storage.free_bytes(), _named(specification, specification.needs_scene)
         if name is None:
             specification.check(Surroundings(None, free_bytes, self._max_image_side))
-            return taken
-        with nullcontext() if before is None else self.files.kept_scene(before, name) as kept:
-            path = self._scenes.path(name) if kept is None else kept
-            header = self._scenes.header(name) if kept is None else read_header(kept)
+            return inputs
+        with nullcontext() if before is None else self.files.kept_scene(before, name) as file:
+            path = self._scenes.path(name) if file is None else file
+            header = self._scenes.header(name) if file is None else read_header(file)
             with storage_full("the scene of the job"):
                 specification.check(Surroundings(header, free_bytes, self._max_image_side))
                 try:
@@ -295,7 +295,7 @@ class JobStore:
                 except FileNotFoundError:
                     self._scenes.path(name)  # raises SceneNotFound where the scene has just gone
                     raise
-        return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
+        return inputs if file is not None else [*inputs, (Kind.SCENE, base_name(name))]
 
     def _keep_carried(self, specification: Specification, name: str | None, job_id: str, before: str | None) -> None:
         """Keeps the file that comes with the job, or came with the job before, for the job. Raises InvalidArgument."""
@@ -329,10 +329,10 @@ class JobStore:
                 )
         return any(holder.private for _, _, holder in whose)
 
-    def _same(self, job_id: str, asked: str) -> Job:
+    def _same(self, job_id: str, digest: str) -> Job:
         """The job that is there already. Raises JobConflict where it asks for something else."""
         row = self._row(job_id)
-        if row.asked != asked:
+        if row.asked != digest:
             raise JobConflict(
                 f"the request_id {row.request_id!r} was used for the job {row.id}, which asks for something else",
                 field="request_id",
@@ -413,7 +413,7 @@ class JobStore:
         queue.forget(self._engine, job_id)
 
     def overview(self) -> JobsOverview:
-        found = queue.count_by_state(self._engine)
+        counts = queue.count_by_state(self._engine)
         states = [worker.state for worker in workers.list_workers(self._engine)]
         oldest_s, unfit, now_s = dict.fromkeys((AUTO, CPU, CUDA), 0.0), 0, time.time()
         living = workers.living_workers(self._engine)
@@ -422,7 +422,7 @@ class JobStore:
             oldest_s[kind] = max(oldest_s[kind], now_s - oldest_ms / 1000.0)
             unfit += count if waits_for(demand, living) is not None else 0
         return JobsOverview(
-            counts={state: found.get(state, 0) for state in JobState},
+            counts={state: counts.get(state, 0) for state in JobState},
             workers={state: states.count(state) for state in WorkerState},
             oldest_waiting_s=oldest_s,
             unfit=unfit,
@@ -449,13 +449,13 @@ class JobStore:
     def artifact(self, job_id: str, name: str) -> Artifact:
         """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
         job = self.get(job_id)
-        found = None
+        artifact = None
         if any(stands_for(one, name) for one in job.artifacts):
-            found = self.files.artifact(job_id, name)
-        if found is None:
+            artifact = self.files.artifact(job_id, name)
+        if artifact is None:
             known = ", ".join(job.artifacts) or "none"
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
-        return found
+        return artifact
 
     def workers(self, shown: Shown = _all_are_shown) -> tuple[Worker, ...]:
         """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
@@ -537,8 +537,8 @@ def _plain(value: Any) -> Any:
 
 def _id_of(text: str, owner: str | None) -> str:
     """The id of the one job of an owner that a text without NUL stands for."""
-    named = text if owner is None else f"{text}\0{owner}"
-    return hashlib.sha256(named.encode("utf-8", "surrogatepass")).hexdigest()[:24]
+    key = text if owner is None else f"{text}\0{owner}"
+    return hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:24]
 
 
 def _named(specification: Specification, field: str | None) -> Any:

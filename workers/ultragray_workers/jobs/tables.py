@@ -199,16 +199,16 @@ def make_tables(engine: sa.Engine) -> None:
     Raises StartupFailed for those of another release.
     """
     with engine.begin() as connection:
-        found = version(connection)
-        if found is None:
+        current = version(connection)
+        if current is None:
             if connection.dialect.name != "sqlite":
                 connection.execute(sa.schema.CreateSchema(SCHEMA, if_not_exists=True))
             TABLES.create_all(connection, checkfirst=False)
             connection.execute(sa.insert(SCHEMA_VERSION).values(version=VERSION))
             connection.execute(sa.insert(CHANGES).values(number=0))
-        elif found != VERSION:
+        elif current != VERSION:
             raise StartupFailed(
-                f"the database of the jobs has tables of version {found}, and this release knows version {VERSION}: "
+                f"the database of the jobs has tables of version {current}, and this release knows version {VERSION}: "
                 "another release has used it; start that one, or restore a backup that this one made",
                 field="database_url",
             )

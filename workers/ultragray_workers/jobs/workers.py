@@ -86,23 +86,23 @@ class Worker:
 def list_workers(engine: sa.Engine) -> list[Worker]:
     """The workers that live, are wanted to rest, or were lost within a day, by name."""
     age_s = queue.now_s(engine) - WORKERS.c.seen_at_s
-    found = read(engine, sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.name))
-    return [_worker_of(row) for row in found]
+    rows = read(engine, sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.name))
+    return [_worker_of(row) for row in rows]
 
 
 def living_workers(engine: sa.Engine) -> list[LivingWorker]:
     is_alive = WORKERS.c.seen_at_s > queue.now_s(engine) - queue.DEAD_AFTER_S
-    found = sa.select(WORKERS.c.name, WORKERS.c.offer, WORKERS.c.wanted).where(is_alive).order_by(WORKERS.c.name)
+    statement = sa.select(WORKERS.c.name, WORKERS.c.offer, WORKERS.c.wanted).where(is_alive).order_by(WORKERS.c.name)
     return [
         LivingWorker(row.name, offer_of_json(row.offer), _wanted_of(row.wanted) is not Wanted.WORK)
-        for row in read(engine, found)
+        for row in read(engine, statement)
     ]
 
 
 def want(engine: sa.Engine, name: str, wanted: Wanted) -> Worker:
     """Tells a worker what is wanted of it, which it does within a second or two. Raises WorkerNotFound."""
-    kept = None if wanted is Wanted.WORK else wanted.value
-    write(engine, sa.update(WORKERS).where(WORKERS.c.name == name).values(wanted=kept))
+    value = None if wanted is Wanted.WORK else wanted.value
+    write(engine, sa.update(WORKERS).where(WORKERS.c.name == name).values(wanted=value))
     workers = {worker.name: worker for worker in list_workers(engine)}
     if name not in workers:
         known = known_names("worker", list(workers))
@@ -201,8 +201,8 @@ class Heartbeat:
             self._look_at_s = time.monotonic() + queue.DEAD_AFTER_S  # others may need longer to come back
 
 
-def _wanted_of(kept: str | None) -> Wanted:
-    return Wanted.WORK if kept is None else Wanted(kept)
+def _wanted_of(value: str | None) -> Wanted:
+    return Wanted.WORK if value is None else Wanted(value)
 
 
 def _worker_of(row: sa.Row[tuple[object, ...]]) -> Worker:

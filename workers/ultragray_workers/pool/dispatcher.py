@@ -72,7 +72,7 @@ class Assignment:
     steps: dict[int, Part] = field(default_factory=dict)
     command: Command | None = None
     batch: tuple[Part, ...] = ()  # all of its steps
-    begun: float = field(default_factory=time.monotonic)  # in seconds
+    start_s: float = field(default_factory=time.monotonic)  # in seconds
     loaded: bool = False  # a scene, which took longer than frames do
     given_up: bool = False
 
@@ -372,7 +372,7 @@ class Dispatcher:
             return
         if answer.last:
             typical = not assignment.loaded and not assignment.given_up
-            self._waiting.settle(assignment.batch, time.monotonic() - assignment.begun, typical=typical)
+            self._waiting.settle(assignment.batch, time.monotonic() - assignment.start_s, typical=typical)
         step = assignment.steps.pop(answer.part)
         ticket = step.ticket
         ticket.in_flight -= 1
@@ -469,9 +469,9 @@ def _is_archive(ticket: Ticket) -> bool:
 
 
 def _task(ticket: Ticket, parts: list[Part]) -> Task[Any]:
-    found: tuple[TaskPart[Any], ...] = tuple(
+    task_parts: tuple[TaskPart[Any], ...] = tuple(
         TaskPart(
-            settings=_sent(part.ticket.request.settings),
+            settings=_without_data(part.ticket.request.settings),
             poses=part.ticket.request.poses[part.first : part.stop],
             first=part.first,
             total=len(part.ticket.request.poses),
@@ -480,7 +480,7 @@ def _task(ticket: Ticket, parts: list[Part]) -> Task[Any]:
         )
         for part in parts
     )
-    return Task(scene=ticket.request.scene, path=ticket.path, version=ticket.request.version, parts=found)
+    return Task(scene=ticket.request.scene, path=ticket.path, version=ticket.request.version, parts=task_parts)
 
 
 def _where(place: Place | None) -> dict[str, int]:
@@ -495,7 +495,7 @@ def _lent(request: RenderRequest[Any]) -> Place | None:
     return request.destination.lend(reply_bytes(settings, len(request.poses)))
 
 
-def _sent(settings: Resolved | SliceView | Search) -> Resolved | SliceView | Search:
+def _without_data(settings: Resolved | SliceView | Search) -> Resolved | SliceView | Search:
     """Settings as a message takes them: the data of a search lie in the memory."""
     return replace(settings, data=b"") if isinstance(settings, Search) else settings
 

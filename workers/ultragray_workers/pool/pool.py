@@ -69,7 +69,7 @@ class Turn:
     def __init__(self, pool: RenderPool, request: RenderRequest[Any]) -> None:
         self.request = request  # with the newest poses
         self.ticket: Ticket | None = None  # None while the file of its scene is not on this host
-        self.held: AbstractContextManager[Path] | None = None  # that file
+        self.hold: AbstractContextManager[Path] | None = None  # that file
         self.is_awaited = False  # somebody waits for the answer
         self._pool = pool
 
@@ -166,7 +166,7 @@ class RenderPool:
         Raises what `render` raises; InvalidArgument and InvalidImageSize also for pixels that are no frame.
         """
         with self.ask(request) as turn:
-            return await self._answer(turn, _what_was_found)
+            return await self._answer(turn, _search_result)
 
     def ask(self, request: RenderRequest[Any]) -> Turn:
         """Puts a request into the queue at once; the caller closes its turn, answered or not.
@@ -215,10 +215,10 @@ class RenderPool:
         """Makes a ticket for a turn, unless the file of its scene is not on this host now."""
         if self._closed:
             raise Draining("the service is stopping")
-        if (held := self._store.hold(turn.request.scene)) is None:
+        if (hold := self._store.hold(turn.request.scene)) is None:
             return
-        turn.held = held
-        turn.ticket = ticket = _ticket(turn.request, held.__enter__())
+        turn.hold = hold
+        turn.ticket = ticket = _ticket(turn.request, hold.__enter__())
         self.deadlines.watch(ticket)
         if self._draining:
             ticket.done.add_done_callback(self._tell_if_answered)
@@ -235,9 +235,9 @@ class RenderPool:
             self.deadlines.forget(ticket)
             ticket.done.cancel()  # or, where it has failed, nobody need have asked why
             self._dispatcher.discard(ticket)
-        held, turn.held = turn.held, None
-        if held is not None:
-            held.__exit__(None, None, None)
+        hold, turn.hold = turn.hold, None
+        if hold is not None:
+            hold.__exit__(None, None, None)
 
     async def load(self, scene: str) -> None:
         """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
@@ -245,8 +245,8 @@ class RenderPool:
         name = base_name(scene)
         for _ in range(MAX_SCENE_CHANGES):
             await asyncio.to_thread(self._store.path, scene)
-            if (held := self._store.hold(name)) is not None:
-                with held as path:
+            if (hold := self._store.hold(name)) is not None:
+                with hold as path:
                     await self._dispatcher.command_all(LoadTask(name, str(path)))
                 return
         raise RenderFailed(f"scene {scene!r} kept changing while it was being loaded", field="scene")
@@ -365,7 +365,7 @@ async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
     )
 
 
-async def _what_was_found(ticket: Ticket, rendered: Rendered) -> SearchResult[Any]:
+async def _search_result(ticket: Ticket, rendered: Rendered) -> SearchResult[Any]:
     return SearchResult(
         scene=ticket.request.scene,
         scene_sha256=rendered.scene_sha256,

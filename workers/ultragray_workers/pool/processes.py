@@ -219,13 +219,13 @@ class Watch:
 
     def __init__(self, config: PoolConfig) -> None:
         self._grace_s, self._timeout_s = config.worker_grace_s, config.worker_timeout_s
-        self._begun = self._heard = 0.0
+        self._start_s = self._heard = 0.0
         self._deadline: float | None = None
         self._loading = False
 
     def begin(self, deadline: float | None) -> None:
         """The worker is given a task whose frames somebody waits for until then; None: for as long as it takes."""
-        self._begun = self._heard = time.monotonic()
+        self._start_s = self._heard = time.monotonic()
         self._deadline = deadline
         self._loading = False
 
@@ -243,7 +243,7 @@ class Watch:
         """The reason to give up on the worker; None while there is none. `taken`: whether it has taken up its task."""
         now = time.monotonic()
         if not taken:
-            late_s = now - self._begun - self._grace_s
+            late_s = now - self._start_s - self._grace_s
             return f"it did not take up its task within {self._grace_s:g} s" if late_s > 0 else None
         if self._loading or self._deadline is None:
             late_s = now - self._heard - self._timeout_s

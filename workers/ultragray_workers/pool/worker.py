@@ -165,8 +165,8 @@ class _Worker:
 
     def _loaded(self, name: str, path: str) -> LoadedScene:
         """A scene, ready for its first frame. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
-        if (held := self._scenes.held(name, path)) is not None:
-            return held
+        if (scene := self._scenes.held(name, path)) is not None:
+            return scene
         self._channel.send(Loading(begins=True))
         try:
             loaded = self._scenes.get(name, path)
@@ -183,7 +183,7 @@ class _Worker:
         return loaded
 
     def _limits(self, name_pose: Callable[[int], str]) -> Limits:
-        """Those of the task at hand, which the service may have given up meanwhile."""
+        """The limits of the task at hand, which the service may have given up meanwhile."""
         return Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, name_pose)
 
     def _rendered(self, loaded: LoadedScene, started: float, **more: Any) -> Rendered:
@@ -252,7 +252,7 @@ class _Worker:
         in_bytes = set().union(*wanted.values()) == {Encoding.UINT8.pixel_type}
         done = 0
 
-        def shown(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
+        def render(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
             nonlocal done
             done += len(some)
             return render_shown(
@@ -267,7 +267,7 @@ class _Worker:
             )
 
         try:
-            return render_to_host(shown, poses, wanted, self._device)
+            return render_to_host(render, poses, wanted, self._device)
         except torch.OutOfMemoryError as error:
             raise MemoryExceeded(
                 f"{len(poses)} frames of {view.height}x{view.width} pixels ({', '.join(outputs)}) do not fit into the "
@@ -288,35 +288,35 @@ class _Worker:
         return self._rendered(loaded, started, size=size, first=part.first)
 
     def _search(self, task: Task[Sought], part: TaskPart[Sought], memory: int) -> Rendered:
-        loaded, asked = self._scene_of(task), part.settings.settings
+        loaded, settings = self._scene_of(task), part.settings.settings
         started, size = time.monotonic(), part.settings.size
         data = read_start(memory, os.fstat(memory).st_size)
-        found = localize(
+        match = localize(
             loaded.scene,
             read_png(data) if size is None else read_grey(data, *size),
             part.poses[0],
-            probe=asked.probe,
-            within_mm=asked.within_mm,
-            within_deg=asked.within_deg,
-            search=asked.search,
+            probe=settings.probe,
+            within_mm=settings.within_mm,
+            within_deg=settings.within_deg,
+            search=settings.search,
             backend=self._backend,
             limits=self._limits(lambda _: "start"),
         )
-        return self._rendered(loaded, started, found=found)
+        return self._rendered(loaded, started, found=match)
 
     def _plan(self, task: Task[NextViews], part: TaskPart[NextViews], memory: int) -> Rendered:
-        loaded, asked = self._scene_of(task), part.settings
+        loaded, request = self._scene_of(task), part.settings
         started = time.monotonic()
-        listed = np.frombuffer(read_start(memory, os.fstat(memory).st_size)).reshape(-1, 4, 4)
-        found = plan_views(
+        reach = np.frombuffer(read_start(memory, os.fstat(memory).st_size)).reshape(-1, 4, 4)
+        view_plan = plan_views(
             loaded.scene,
-            asked.settings,
-            poses=listed if len(listed) else None,
-            view=asked.standard_plane,
-            start=asked.start,
+            request.settings,
+            poses=reach if len(reach) else None,
+            view=request.standard_plane,
+            start=request.start,
             limits=self._limits(lambda _: "poses"),
         )
-        return self._rendered(loaded, started, found=found)
+        return self._rendered(loaded, started, found=view_plan)
 
     _WORK: ClassVar[dict[type, Callable[..., Rendered]]] = {SliceView: _sample, Sought: _search, NextViews: _plan}
 
@@ -466,8 +466,8 @@ class SceneCache:
 
     def get(self, name: str, path: str) -> LoadedScene:
         """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
-        if (held := self.held(name, path)) is not None:
-            return held
+        if (scene := self.held(name, path)) is not None:
+            return scene
         self._make_room(name, path)
         self._scenes[name] = loaded = self._load(name, path)
         return loaded
@@ -479,10 +479,10 @@ class SceneCache:
         except SceneFileInvalid:
             self.drop(name)
             raise
-        held = self._scenes.get(name)
-        if held is not None and held.version == version:
+        scene = self._scenes.get(name)
+        if scene is not None and scene.version == version:
             self._scenes.move_to_end(name)
-            return held
+            return scene
         self.drop(name)
         return None
 

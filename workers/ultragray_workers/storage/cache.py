@@ -135,7 +135,7 @@ class Cache:
 
     def held_bytes(self) -> int:
         with self._room():
-            return sum(size for _, size, _ in self._held())
+            return sum(size for _, size, _ in self._entries())
 
     def _fetch(self, name: str, storage: Storage, key: str, version: str, sha256: str | None) -> tuple[Pin, int]:
         entry = storage.entry(key)
@@ -174,18 +174,18 @@ class Cache:
 
     def _try_to_reserve(self, part: Path, needed: int) -> bool:
         with self._room():
-            held = sorted(self._held())
-            left = self.max_bytes - sum(size for _, size, _ in held)
-            for used_at_s, size, path in held:
-                if left < needed and self._remove(path, used_at_s):
-                    left += size
-            if left < needed:
+            entries = sorted(self._entries())
+            free_bytes = self.max_bytes - sum(size for _, size, _ in entries)
+            for used_at_s, size, path in entries:
+                if free_bytes < needed and self._remove(path, used_at_s):
+                    free_bytes += size
+            if free_bytes < needed:
                 return False
             with part.open("wb") as file:
                 file.truncate(needed)
             return True
 
-    def _held(self) -> Iterator[tuple[float, int, Path]]:
+    def _entries(self) -> Iterator[tuple[float, int, Path]]:
         """When each object was used last, its bytes, and its file."""
         for path in self._files.glob("*"):
             if not path.name.endswith(TEMPORARY_SUFFIX):  # of a download, which counts by its part
@@ -249,8 +249,8 @@ def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> 
 
 
 def _check(file: Path, name: str, sha256: str) -> None:
-    if (got := file_sha256(file)) != sha256:
-        raise Damaged(f"{name} is damaged: its SHA-256 is {got}")
+    if (digest := file_sha256(file)) != sha256:
+        raise Damaged(f"{name} is damaged: its SHA-256 is {digest}")
 
 
 def _is_at(file: IO[bytes], path: Path) -> bool:

@@ -34,7 +34,7 @@ class FileVersion:
 
     @classmethod
     def of(cls, path: str | Path | int) -> FileVersion:
-        """That of a file, by its path or descriptor. Raises OSError."""
+        """The version of a file, by its path or descriptor. Raises OSError."""
         return cls._of(os.stat(path))
 
     @classmethod
@@ -88,34 +88,34 @@ class LocalStorage:
             return file.read(-1 if length is None else length)
 
     def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
-        def fill(made: Path) -> None:
-            made.write_bytes(data)
-            sync(made)
+        def fill(file: Path) -> None:
+            file.write_bytes(data)
+            sync(file)
 
         return self._put(key, fill, if_absent) or self._path(key).read_bytes() == data
 
     def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
         if if_absent and self._path(key).exists():
             return False
-        return self._put(key, lambda made: link_or_copy(path, made), if_absent)
+        return self._put(key, lambda file: link_or_copy(path, file), if_absent)
 
     def _put(self, key: str, fill: Callable[[Path], object], if_absent: bool) -> bool:
         """Whether what `fill` writes is the object now; False: `if_absent`, and there is one."""
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with self._whole(path) as made:
-            fill(made)
+        with self._whole(path) as file:
+            fill(file)
             if not if_absent:
-                made.replace(path)
-            elif not self._place_new(made, path):
+                file.replace(path)
+            elif not self._place_new(file, path):
                 return False
         sync(path.parent)
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
-        with self._open(key, version) as descriptor, self._whole(path) as made:
-            link_or_copy(self._path(key), made)
-            made.replace(path)
+        with self._open(key, version) as descriptor, self._whole(path) as file:
+            link_or_copy(self._path(key), file)
+            file.replace(path)
             return self._entry(key, os.stat(descriptor))
 
     def delete(self, key: str) -> None:
@@ -142,9 +142,9 @@ class LocalStorage:
     def claimed(self, token: str) -> Iterator[None]:
         path = self._path(f"{_CLAIMS}/{token}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        with self._whole(path) as made, made.open("wb") as lock:
+        with self._whole(path) as file, file.open("wb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            made.rename(path)  # nobody finds it unlocked
+            file.rename(path)  # nobody finds it unlocked
             try:
                 yield
             finally:
@@ -189,16 +189,16 @@ class LocalStorage:
     @contextlib.contextmanager
     def _whole(self, path: Path) -> Iterator[Path]:
         """A path beside `path` on which nothing is yet; what is there at the end is removed."""
-        made = path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
         try:
-            yield made
+            yield temporary
         finally:
-            made.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
-    def _place_new(self, made: Path, path: Path) -> bool:
+    def _place_new(self, file: Path, path: Path) -> bool:
         """Gives a whole file its place, unless there is one already."""
         try:
-            os.link(made, path)
+            os.link(file, path)
         except FileExistsError:
             return False
         except OSError:  # a file system without links
@@ -206,7 +206,7 @@ class LocalStorage:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 if path.exists():
                     return False
-                made.replace(path)
+                file.replace(path)
         return True
 
     @staticmethod

@@ -21,20 +21,20 @@ _PREFIX = re.compile(r"[A-Za-z0-9._~=/-]*")
 Location = Path | StorageUrl
 
 
-def parse_location(given: str | Path | StorageUrl, field: str) -> Location:
+def parse_location(location: str | Path | StorageUrl, field: str) -> Location:
     """A folder, or the URL of a bucket; `file://` is a folder.
 
     Raises InvalidArgument, which names `field`, for other URLs and those with credentials, a query or a fragment.
     """
-    if not isinstance(given, str):
-        return given
-    if "://" not in given:
-        return Path(given)
-    scheme = given.partition("://")[0].lower()
+    if not isinstance(location, str):
+        return location
+    if "://" not in location:
+        return Path(location)
+    scheme = location.partition("://")[0].lower()
     if scheme not in (*_SCHEMES, "file"):
         raise InvalidArgument(f"{field} must be {_KNOWN}, got a URL with the scheme {scheme!r}", field=field)
     try:
-        parts = urlsplit(given)
+        parts = urlsplit(location)
     except ValueError as error:
         raise InvalidArgument(f"{field} must be {_KNOWN}: {error}", field=field) from None
     if "@" in parts.netloc:
@@ -45,16 +45,16 @@ def parse_location(given: str | Path | StorageUrl, field: str) -> Location:
         )
     if parts.query or parts.fragment:
         raise InvalidArgument(
-            f"{field} must have neither ? nor #, got one after {given[: len(scheme) + 3]}…", field=field
+            f"{field} must have neither ? nor #, got one after {location[: len(scheme) + 3]}…", field=field
         )
     if scheme == "file":
         if parts.netloc not in ("", "localhost") or not parts.path.startswith("/"):
             raise InvalidArgument(
-                f"{field} must name a folder of this machine, as file:///FOLDER, got {given!r}", field=field
+                f"{field} must name a folder of this machine, as file:///FOLDER, got {location!r}", field=field
             )
         return Path(unquote(parts.path))
     if not _BUCKET.fullmatch(parts.netloc):
-        raise InvalidArgument(f"{field} must name a bucket, as {scheme}://BUCKET/PREFIX, got {given!r}", field=field)
+        raise InvalidArgument(f"{field} must name a bucket, as {scheme}://BUCKET/PREFIX, got {location!r}", field=field)
     prefix = parts.path.strip("/")
     if not _PREFIX.fullmatch(prefix) or any(part in ("", ".", "..") for part in prefix.split("/") if prefix):
         raise InvalidArgument(
@@ -70,12 +70,12 @@ def open_storage(location: str | Path | StorageUrl, *, patience_s: float = PATIE
     `patience_s`: how long a request to a bucket is repeated before StorageUnavailable.
     Raises InvalidArgument for another URL, ExtraMissing where obstore is not installed.
     """
-    found = parse_location(location, "location")
-    if isinstance(found, Path):
-        return LocalStorage(found)
+    place = parse_location(location, "location")
+    if isinstance(place, Path):
+        return LocalStorage(place)
     from ultragray_workers.storage.remote import RemoteStorage
 
-    return RemoteStorage(found, patience_s=patience_s)
+    return RemoteStorage(place, patience_s=patience_s)
 
 
 def below(location: Location, key: str) -> Location:

@@ -77,13 +77,13 @@ class RemoteStorage:
                 page = next(pages, None)
             if page is None:
                 return
-            for found in page:
-                yield _entry(found)
+            for item in page:
+                yield _entry(item)
 
     def entries_in(self, prefix: str = "") -> Iterator[Entry]:
         with self._asking():
-            found = self._obstore.list_with_delimiter(self._store, check_key(prefix) if prefix else None)
-        yield from map(_entry, found["objects"])
+            page = self._obstore.list_with_delimiter(self._store, check_key(prefix) if prefix else None)
+        yield from map(_entry, page["objects"])
 
     def entry(self, key: str) -> Entry | None:
         try:
@@ -251,13 +251,13 @@ def _client_options(scheme: str) -> Any:
         "timeout": f"{_REQUEST_TIMEOUT_S}s",
     }
     names = (*options, "allow_http", "allow_invalid_certificates", "proxy_url", "proxy_excludes", "user_agent")
-    given = {name: os.environ.get(f"{_ENVIRONMENT[scheme]}_{name.upper()}") for name in names}
-    return options | {name: value for name, value in given.items() if value}
+    variables = {name: os.environ.get(f"{_ENVIRONMENT[scheme]}_{name.upper()}") for name in names}
+    return options | {name: value for name, value in variables.items() if value}
 
 
-def _entry(found: Any) -> Entry:
-    version = found["e_tag"] or found["version"] or f"{found['last_modified'].timestamp():.6f}-{found['size']}"
-    return Entry(found["path"], found["size"], version, found["last_modified"].timestamp())
+def _entry(item: Any) -> Entry:
+    version = item["e_tag"] or item["version"] or f"{item['last_modified'].timestamp():.6f}-{item['size']}"
+    return Entry(item["path"], item["size"], version, item["last_modified"].timestamp())
 
 
 def _reason(text: str) -> str:

@@ -55,8 +55,8 @@ PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Datasets on
 Private = Annotated[bool, Query(description="Whether others may not see it.")]
 
 
-def _given_options(**given: str) -> dict[str, str]:
-    return {name: value for name, value in given.items() if value}
+def _given_options(**options: str) -> dict[str, str]:
+    return {name: value for name, value in options.items() if value}
 
 
 _given_options.__signature__ = Signature(  # type: ignore[attr-defined]  # what FastAPI reads

@@ -60,9 +60,9 @@ class LastEvent:
 
     @classmethod
     def read(cls, event_id: str) -> LastEvent:
-        if (found := _ID.fullmatch(event_id)) is None:
+        if (match := _ID.fullmatch(event_id)) is None:
             return cls()
-        return cls(int(found[1]), found[2])
+        return cls(int(match[1]), match[2])
 
 
 async def _events(watch: JobWatch, last: LastEvent) -> AsyncIterator[bytes]:
@@ -234,10 +234,10 @@ async def get_artifact(
     show: Annotated[bool, Query(description="A browser shows it instead of saving it; pages run no scripts.")] = False,
 ) -> Response:
     """Downloads a file that the job made. Ranges are answered, so that a download can go on."""
-    found = await service.jobs.do(JobStore.artifact, job, name)
+    artifact = await service.jobs.do(JobStore.artifact, job, name)
     media_type = MEDIA_TYPES.get(PurePosixPath(name).suffix, _ANY_FILE)
     disposition = "inline" if show else "attachment"
-    return artifact_response(found, request.headers, media_type, disposition)
+    return artifact_response(artifact, request.headers, media_type, disposition)
 
 
 @router.get("/{job}/events", response_class=StreamingResponse, responses=_EVENTS | problems(401, 404, 422, 503))
@@ -262,7 +262,7 @@ _CHUNK_BYTES = 2**20
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 
-def artifact_response(file: Artifact, asked: Headers, media_type: str, disposition: str) -> Response:
+def artifact_response(file: Artifact, request_headers: Headers, media_type: str, disposition: str) -> Response:
     """The answer to a GET of a file or of one range of it; `disposition`: inline or attachment."""
     etag = f'"{file.stored.sha256}"'
     headers = {
@@ -273,11 +273,11 @@ def artifact_response(file: Artifact, asked: Headers, media_type: str, dispositi
     }
     start, end, status = 0, file.stored.bytes, 200
     if (
-        asked.get("if-range", etag) == etag
-        and (found := _RANGE.fullmatch(asked.get("range", "")))
-        and any(found.groups())
+        request_headers.get("if-range", etag) == etag
+        and (match := _RANGE.fullmatch(request_headers.get("range", "")))
+        and any(match.groups())
     ):
-        first, last = found.groups()
+        first, last = match.groups()
         start = int(first) if first else max(0, end - int(last))
         if first and last:
             end = min(end, int(last) + 1)

@@ -114,14 +114,14 @@ async def render(request: Request) -> Response:
         return planner.check_pixels(FORMATS["dicom"].shown(settings) if is_dicom else settings, len(poses))
 
     plan = await planner.plan(scene, body, choice.encoding, registration=body.registration, complete=complete)
-    sent = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
-    exact = plan.placed(sent)
+    sent_poses = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
+    exact = plan.placed(sent_poses)
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
     counted = service.limits.take_frames(len(exact), deadline)
     await (counted if len(exact) == 1 else finish_or_abandon(counted, request.receive, deadline))  # many take seconds
-    with service.rendering.ask(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by) as asked:
-        result = await finish_or_abandon(asked.frames(), request.receive, deadline)
+    with service.rendering.ask(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by) as pending:
+        result = await finish_or_abandon(pending.frames(), request.receive, deadline)
     data = await asyncio.to_thread(_dicom_of, result, body) if is_dicom else result.data
     return Response(data, 200, render_headers(result), choice.media_type)
 
@@ -193,14 +193,14 @@ _SLICE_ANSWER = answer(
 async def render_slice(request: Request, service: ServiceDep, scene: SceneName) -> Response:
     """A field of the scene on any plane, without a probe. It waits and counts as a frame does."""
     media_type = choose_of_slice(request.headers.get("accept", ""))
-    asked = await read_json_body(request, SliceSettings)
+    settings = await read_json_body(request, SliceSettings)
     deadline = service.planner.deadline(None)
-    encoding = Encoding.PNG if media_type == PNG else asked.numbers
-    plan = await service.planner.plan_slice(scene, asked, encoding)
+    encoding = Encoding.PNG if media_type == PNG else settings.numbers
+    plan = await service.planner.plan_slice(scene, settings, encoding)
 
     async def rendered() -> RenderResult[SliceView]:
         await service.limits.take_frames(1, deadline)
-        return await service.rendering.render_slice(plan, asked.pose(), deadline=deadline)
+        return await service.rendering.render_slice(plan, settings.pose(), deadline=deadline)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = _npy_of(result) if media_type == NPY else result.data

@@ -348,10 +348,10 @@ async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
 def _poses_json(header: SceneHeader) -> bytes:
     chosen = even_selection(len(header.training_poses), MAX_POSES)
     sizes = CorrectionSizes.of(header)
-    found = {
+    fields = {
         "poses": header.training_poses.reshape(-1, 16),
         "rest_poses": None if header.rest_poses is None else header.rest_poses.reshape(-1, 16),
         "shift_mm": None if sizes is None else sizes.shift_mm,
         "turn_deg": None if sizes is None else sizes.turn_deg,
     }
-    return json.dumps({name: None if one is None else one[chosen].tolist() for name, one in found.items()}).encode()
+    return json.dumps({name: None if one is None else one[chosen].tolist() for name, one in fields.items()}).encode()

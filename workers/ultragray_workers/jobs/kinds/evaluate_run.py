@@ -57,13 +57,13 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         **evaluation.to_dict(),
         "held_out": held_out.to_dict(),
         "uncertainty": None if reliability is None else reliability.to_dict(),
-        "baselines": {method: found.to_dict() for method, found in baselines.items()},
+        "baselines": {method: scores.to_dict() for method, scores in baselines.items()},
         "voxel_mm": voxel_mm if baselines else None,
     }
     metrics = evaluation.mean.to_dict() | evaluation.speckle.figures() | held_out.figures()
     metrics |= {} if reliability is None else reliability.figures()
-    for method, found in baselines.items():
-        metrics |= {f"{method}_{name}": value for name, value in found.mean.to_dict().items()}
+    for method, scores in baselines.items():
+        metrics |= {f"{method}_{name}": value for name, value in scores.mean.to_dict().items()}
     with job_run.folder.new_artifacts() as folder:
         (folder / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         write_spread(scene, dataset.val, evaluation, folder, PICTURES)

@@ -67,30 +67,30 @@ class Following:
         Raises DatasetNotFound where the recording was deleted.
         """
         if self.dataset is not None:
-            return self._left(most)
+            return self._rest(most)
         now_s = time.monotonic()
         if now_s - self._looked_at_s < LOOK_EVERY_S:
             return None
         self._looked_at_s = now_s
-        found = []
+        frames = []
         try:
             for block in self._datasets.recordings.frames(self._name, self._blocks):
-                found += block
+                frames += block
                 self._blocks += 1
-                if len(found) >= most:
+                if len(frames) >= most:
                     break
         except DatasetNotFound:  # it has become a data set, or is gone
             self._finish()
-            return self._left(most)
-        if not found:
+            return self._rest(most)
+        if not frames:
             return None
-        self._taken += len(found)
-        return np.stack([one.pixels for one in found]), np.stack([one.pose for one in found])
+        self._taken += len(frames)
+        return np.stack([one.pixels for one in frames]), np.stack([one.pose for one in frames])
 
     def _finish(self) -> None:
         self.dataset = self._datasets.load(self._name)
 
-    def _left(self, most: int) -> tuple[ByteArray, FloatArray] | None:
+    def _rest(self, most: int) -> tuple[ByteArray, FloatArray] | None:
         assert self.dataset is not None
         images, poses = in_recorded_order(self.dataset)
         first, self._taken = self._taken, min(len(images), self._taken + most)
@@ -208,12 +208,12 @@ class _Live:
             self._save()
 
     def _tell(self) -> None:
-        trainer, told = self.trainer, self._run.progress
+        trainer, progress = self.trainer, self._run.progress
         self._run.report(
             Progress(
                 phase="live",
                 step=trainer.step,
-                val_psnr_db=told.val_psnr_db,
+                val_psnr_db=progress.val_psnr_db,
                 gaussians=trainer.gaussian_count,
                 frames_done=trainer.frame_count,
                 rate_per_s=self._steps_per_s,
@@ -237,8 +237,8 @@ class _Live:
             return
         count = GrowingTrainer.frames_of(self._checkpoint)
         parts: list[tuple[ByteArray, FloatArray]] = []
-        while (left := count - sum(len(images) for images, _ in parts)) > 0:
-            part = self._run.patiently(partial(self.following.next, left), StorageUnavailable)
+        while (missing := count - sum(len(images) for images, _ in parts)) > 0:
+            part = self._run.patiently(partial(self.following.next, missing), StorageUnavailable)
             if part is not None:
                 parts.append(part)
         images, poses = (np.concatenate(some) for some in zip(*parts, strict=True))

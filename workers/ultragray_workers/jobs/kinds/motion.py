@@ -73,8 +73,8 @@ class MotionJob(MotionSettings, Specification):
         """The way from the file's frame into the scene's; None where they are the same. Raises InvalidPose."""
         if self.field_to_scene is None:
             return None
-        given = np.array(self.field_to_scene)
-        exact: FloatArray = check_poses(given.reshape(4, 4) if given.size == 16 else given, field="field_to_scene")[0]
+        array = np.array(self.field_to_scene)
+        exact: FloatArray = check_poses(array.reshape(4, 4) if array.size == 16 else array, field="field_to_scene")[0]
         return exact
 
     def registered(self, registration: Registration) -> Self:

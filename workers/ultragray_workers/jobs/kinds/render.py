@@ -106,7 +106,7 @@ class RenderJob(FrameSettings, Specification):
 
     @classmethod
     def is_in_shards(cls, document: Mapping[str, Any]) -> bool:
-        """As `Specification`: where it asks for a number of frames in a file, or for more than one file holds."""
+        """Whether it asks for a number of frames in a file, or for more than one file holds."""
         sampler = document.get("sampler") or {}
         return document.get("shard_frames") is not None or (sampler.get("count") or 0) > MAX_POSES
 

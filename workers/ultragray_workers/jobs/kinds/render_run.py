@@ -41,21 +41,21 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
         return shards_run.run(job_run, job)
     device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
-    described = read_header(path)
-    settings = job.resolved(described.info, Encoding.FLOAT32)
+    header = read_header(path)
+    settings = job.resolved(header.info, Encoding.FLOAT32)
     limits = Limits(job_run.request.max_footprint_pixels)
     scene = GaussianScene.load(path).to(device)
-    assess = _assessing(job_run, described, settings)
+    assess = _assessing(job_run, header, settings)
     if job.sampler is not None:
         assess = assess_by_rendering(scene, settings, assess, limits=limits)
-    poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
+    poses, extrapolations = job.assessed_poses(header.training_poses, settings.probe, assess)
     free = shutil.disk_usage(job_run.folder.path).free
     job.check_room(len(poses), job.file_format.shown(settings).picture, free)
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
     with job_run.folder.new_artifacts() as folder:
         name = f"frames{job.file_format.suffix}"
-        found, sha256 = render_to_file(
+        assessments, sha256 = render_to_file(
             folder / name,
             job.file_format.name,
             scene,
@@ -68,8 +68,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
             limits=limits,
             before_portion=job_run.counter(len(poses)),
         )
-        _write_examples(folder, scene, settings, poses, found, limits)
-    confidences = [one.confidence for one in found if one.confidence is not None]
+        _write_examples(folder, scene, settings, poses, assessments, limits)
+    confidences = [one.confidence for one in assessments if one.confidence is not None]
     metrics = {}
     if confidences:
         least, mean, greatest = min(confidences), fmean(confidences), max(confidences)
@@ -89,25 +89,25 @@ def _write_examples(
     """A few frames, evenly spread, as pictures true to scale: what one looks at before one loads them all."""
     places = spread_places(len(poses), EXAMPLES)
     pixel_mm = settings.display.pixel_mm or settings.probe.box_mm.longer_side / EXAMPLE_SIDE
-    shown = replace(settings, outputs=settings.outputs[:1], display=replace(settings.display, pixel_mm=pixel_mm))
-    portions = render_portions(scene, shown, poses[places], [extrapolations[at] for at in places], limits=limits)
-    (name,) = shown.outputs
+    view = replace(settings, outputs=settings.outputs[:1], display=replace(settings.display, pixel_mm=pixel_mm))
+    portions = render_portions(scene, view, poses[places], [extrapolations[at] for at in places], limits=limits)
+    (name,) = view.outputs
     pictures = (picture for frames, _ in portions for picture in frames[name])
     for place, picture in zip(places, pictures, strict=True):
         write_whole(folder / f"example_{place:05d}.png", png_file(to_uint8(OUTPUTS[name].shares(picture))))
 
 
-def _assessing(job_run: JobRun, described: SceneHeader, settings: Resolved) -> Assess:
+def _assessing(job_run: JobRun, header: SceneHeader, settings: Resolved) -> Assess:
     """A function that tells how far poses extrapolate, until the job is to stop."""
-    assessor = Assessor(described.info, described.training_poses)
-    at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
+    assessor = Assessor(header.info, header.training_poses)
+    at_once = max(1, ASSESSED_AT_ONCE // max(1, len(header.training_poses)))
 
     def assess(poses: FloatArray) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
-        found: list[Extrapolation] = []
+        extrapolations: list[Extrapolation] = []
         for first in range(0, len(poses), at_once):
             if job_run.should_stop():
                 raise Stopped
-            found.extend(assessor.assess(poses[first : first + at_once], settings.probe, phase=settings.phase))
-        return found
+            extrapolations.extend(assessor.assess(poses[first : first + at_once], settings.probe, phase=settings.phase))
+        return extrapolations
 
     return assess

@@ -149,7 +149,7 @@ class ShardQueue:
         self._looking: Future[None] | None = None
         self._looked_at_s = float("-inf")
         self._of_batch: int | None = None  # frames that are done; None: not known yet
-        self._made = self._furthest = 0  # frames
+        self._own_frames = self._furthest = 0  # frames
         self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
         url = os.environ[DATABASE_VARIABLE]
         self._database = self._patiently(lambda: JobDatabase(folder.artifact_folder, url, place.storage))
@@ -175,11 +175,11 @@ class ShardQueue:
 
     def take(self) -> int | None:
         """The next shard; None where this process is not needed any more. Raises BatchFailed, Stopped."""
-        found = self._ahead or self._threads.submit(self._take)
-        while not found.done():
+        future = self._ahead or self._threads.submit(self._take)
+        while not future.done():
             self.report()
-            wait([found], _POLL_S)
-        shard = found.result()
+            wait([future], _POLL_S)
+        shard = future.result()
         self._ahead = None if shard is None else self._threads.submit(self._take)
         return shard
 
@@ -187,7 +187,7 @@ class ShardQueue:
         """Lets a thread put a shard in its place, beside the rendering of the next one: at most one waits."""
         self.wait_until_kept()
         self._keeping = self._threads.submit(self._keep, path, shard, entry)
-        self._made += entry.frames
+        self._own_frames += entry.frames
 
     def wait_until_kept(self) -> None:
         if self._keeping is not None:
@@ -200,8 +200,8 @@ class ShardQueue:
 
     def complete(self, shard: int) -> None:
         """Says that a shard is in its place. Raises Stopped."""
-        made = sa.update(SHARDS).where(_ROWS.job == self._batch, _ROWS.number == shard)
-        self._change(made.values(done=True, share=None, error=None, reason=None))
+        statement = sa.update(SHARDS).where(_ROWS.job == self._batch, _ROWS.number == shard)
+        self._change(statement.values(done=True, share=None, error=None, reason=None))
 
     def report(self, done: int = 0) -> None:
         """Reports how far the batch is, or what its share has made; `done`: frames of the shard at hand.
@@ -216,7 +216,7 @@ class ShardQueue:
             if self._looking is not None:
                 self._looking.result()
             self._looked_at_s, self._looking = now_s, self._threads.submit(self._look)
-        before_it = self._of_batch if self._is_batch else self._made
+        before_it = self._of_batch if self._is_batch else self._own_frames
         if before_it is None:
             return
         frames, total = self._place.plan.frames, max(self._furthest, done + before_it)
@@ -259,13 +259,13 @@ class ShardQueue:
     def _raise_failure(self) -> None:
         """Raises BatchFailed for the first shard that cannot be made, where there is one."""
         is_lost = sa.and_(_ROWS.share.is_(None), _ROWS.tries >= MOST_TRIES)
-        found = (
+        query = (
             sa.select(_ROWS.error, _ROWS.reason)
             .where(_ROWS.job == self._batch, ~_ROWS.done, sa.or_(_ROWS.error.is_not(None), is_lost))
             .order_by(_ROWS.number)
             .limit(1)
         )
-        for row in read(self._database.engine, found):
+        for row in read(self._database.engine, query):
             why = row.reason or f"its process or worker died {MOST_TRIES} times"
             raise BatchFailed(row.error or "INTERNAL", why)
 

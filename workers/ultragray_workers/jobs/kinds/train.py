@@ -60,6 +60,6 @@ class TrainJob(Specification):
         _require(memory_gb <= most_gb, "settings.memory_gb", f"at most the {most_gb:.1f} GiB of the host", memory_gb)
 
 
-def _require(holds: bool, field: str, expected: str, given: Any) -> None:
+def _require(holds: bool, field: str, expected: str, value: Any) -> None:
     if not holds:
-        raise InvalidArgument(f"{field} must be {expected}, got {shown(given)}", field=field)
+        raise InvalidArgument(f"{field} must be {expected}, got {shown(value)}", field=field)

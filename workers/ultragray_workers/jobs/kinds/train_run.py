@@ -55,13 +55,13 @@ def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool
     placed = dataset if agreed is None else agreed.of(dataset)
     few = replace(placed, val=placed.val.select(spread_places(len(placed.val), VALIDATION_FRAMES)))
     voxel_mm = affordable_voxel_mm(dataset.train)
-    found: dict[str, float] = {}
+    psnrs_db: dict[str, float] = {}
     for method in METHODS:
         if should_stop():
             return
-        found |= {name: one.mean.psnr_db for name, one in evaluate_baselines(few, (method,), voxel_mm).items()}
+        psnrs_db |= {name: one.mean.psnr_db for name, one in evaluate_baselines(few, (method,), voxel_mm).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json.dumps(found) + "\n")
+    write_whole(path, json.dumps(psnrs_db) + "\n")
 
 
 # The time that a training takes after its steps, by what it takes here to render a frame and to score one.
@@ -82,13 +82,13 @@ class Finishing:
         held_out = len(dataset.val)
         measured = len(held_out_frames(dataset.train)) if config.confidence else 0
         fitted = 0 if measured < LEAST_HELD_OUT else min(measured, MEASURED_FRAMES) + MEASURED_FRAMES // 3
-        shown = PICTURES + min(held_out, REPORT_FRAMES)
+        picture_count = PICTURES + min(held_out, REPORT_FRAMES)
         reported = 2 * held_out if config.refine_poses in WITH_PATH else held_out  # at most: also on the path
         # renderings and scores of each phase
         self._work = {
             "evaluation": (float(held_out), held_out),
             "confidence": (CONFIDENCE_RENDERINGS * fitted, fitted + (BLACK_FRAMES if fitted else 0)),
-            "report": (float(reported + _PANELS * shown), reported) if held_out else (0.0, 0),
+            "report": (float(reported + _PANELS * picture_count), reported) if held_out else (0.0, 0),
         }
         self._plots_s = PLOTS_S if held_out else 0.0
 
@@ -98,7 +98,7 @@ class Finishing:
             self._frame_s = 1.0 / (steps_per_s * self._views * STEP_RENDERINGS)
 
     def seconds_from(self, phase: str) -> float:
-        """Of this phase and all that come after it."""
+        """The seconds that a phase and all later ones take."""
         phases = list(self._work)
         work = [self._work[one] for one in phases[phases.index(phase) :]]
         return self._plots_s + sum(frames * self._frame_s + scores * self._score_s for frames, scores in work)
@@ -162,14 +162,14 @@ def _better(scene: GaussianScene, other: GaussianScene, dataset: Dataset, by_db:
     if measured.psnr_db < scene.info.metrics["psnr_db"] + by_db:
         return scene
     sys.stderr.write(f"the scene that was served before is better, {measured.psnr_db:.2f} dB: it stays\n")
-    trained = scene.info
+    info = scene.info
     other.info = replace(
         other.info,
         metrics=measured.to_dict(),
-        confidence=trained.confidence,
-        speckle=trained.speckle,
+        confidence=info.confidence,
+        speckle=info.speckle,
         training={**other.info.training, "steps": other.info.training["step"]},
-        dataset_sha256=trained.dataset_sha256,
+        dataset_sha256=info.dataset_sha256,
     )
     return other
 
@@ -179,11 +179,11 @@ def _report(job_run: JobRun, state: TrainingProgress, finishing: Finishing) -> N
         left_s = _known(state.seconds_left + finishing.seconds_from("confidence"))
         job_run.report(replace(job_run.progress, phase="confidence", seconds_left=left_s))
     elif state.beside is not None:
-        job_run.report(_told(state, "effort", None))
+        job_run.report(_progress_of(state, "effort", None))
     else:
         finishing.observe(state.steps_per_s)
         phase = "training" if state.step < state.steps else "evaluation"
-        job_run.report(_told(state, phase, _known(state.seconds_left + finishing.seconds_from("evaluation"))))
+        job_run.report(_progress_of(state, phase, _known(state.seconds_left + finishing.seconds_from("evaluation"))))
     if state.step * _LINES // state.steps > (state.step - 1) * _LINES // state.steps:
         held_out = "" if state.val_psnr_db is None else f", held out {state.val_psnr_db:.2f} dB"
         sys.stderr.write(
@@ -198,7 +198,7 @@ def _known(seconds: float) -> float | None:
     return seconds if math.isfinite(seconds) else None
 
 
-def _told(state: TrainingProgress, phase: str, seconds_left: float | None) -> Progress:
+def _progress_of(state: TrainingProgress, phase: str, seconds_left: float | None) -> Progress:
     return Progress(
         phase=phase,
         step=state.step,

@@ -49,25 +49,25 @@ class HostDevice:
     lock_name: str
 
 
-def devices_of(asked: str) -> tuple[HostDevice, ...]:
+def devices_of(device: str) -> tuple[HostDevice, ...]:
     """The devices of this host that auto, cpu, cuda or cuda:N means, the preferred one first.
 
     auto: every GPU, then the processor; cuda: every GPU. Raises StartupFailed for a GPU that is not there, and for what
     is no device.
     """
     try:
-        check_device(asked)
+        check_device(device)
     except InvalidArgument as error:
         raise StartupFailed(error.detail, field="device") from None
-    if asked == CPU or (asked == AUTO and not any(driver.exists() for driver in _DRIVERS)):
+    if device == CPU or (device == AUTO and not any(driver.exists() for driver in _DRIVERS)):
         return (_processor(),)
     gpus = _gpus()
-    if asked == AUTO:
+    if device == AUTO:
         return (*gpus, _processor())
-    chosen = tuple(gpu for gpu in gpus if asked in (CUDA, gpu.offered.name))
+    chosen = tuple(gpu for gpu in gpus if device in (CUDA, gpu.offered.name))
     if not chosen:
         there = ", ".join(gpu.offered.name for gpu in gpus) or "no GPU that torch can use"
-        raise StartupFailed(f"device must be one of this host, got {asked!r}; it has {there}", field="device")
+        raise StartupFailed(f"device must be one of this host, got {device!r}; it has {there}", field="device")
     return chosen
 
 
@@ -79,7 +79,7 @@ def _processor() -> HostDevice:
 
 
 def _gpus() -> tuple[HostDevice, ...]:
-    told = subprocess.run(
+    answer = subprocess.run(
         [sys.executable, "-c", _ASK_TORCH],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         stdout=subprocess.PIPE,
@@ -88,7 +88,7 @@ def _gpus() -> tuple[HostDevice, ...]:
     ).stdout
     return tuple(
         HostDevice(WorkerDevice(name=f"{CUDA}:{index}", model=model, memory_bytes=memory), lock_name=f"gpu-{uuid}")
-        for index, (model, memory, uuid) in enumerate(json.loads(told))
+        for index, (model, memory, uuid) in enumerate(json.loads(answer))
     )
 
 
@@ -176,10 +176,10 @@ class Gate:
             for key in self._waiting():
                 fitting[key] = {device.name for device in self.offer.fitting(demand_of_key(key))}
         wanted = set().union(*fitting.values())  # which one it will be is known when the job is
-        held = {name for name, lock in self._locks.items() if name in wanted and self._takes(lock)}
-        if not held:
+        devices = {name for name, lock in self._locks.items() if name in wanted and self._takes(lock)}
+        if not devices:
             self.close()
-        return [key for key, names in fitting.items() if names & held]
+        return [key for key, names in fitting.items() if names & devices]
 
     def hold(self, demand: Demand) -> DeviceLock | None:
         """The lock of a device that fits a job, held; the others are let go. None: all of them are in use.

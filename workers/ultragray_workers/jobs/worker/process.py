@@ -124,10 +124,10 @@ class JobProcess:
 
     def _take_answer(self) -> None:
         """Waits for the process's number, or for its end, which is the template's where that has died."""
-        told = b""
+        answer = b""
         with suppress(ConnectionResetError):
-            told = self._answers.recv(MAX_ANSWER_BYTES)
-        kind, _, number = told.partition(b" ")
+            answer = self._answers.recv(MAX_ANSWER_BYTES)
+        kind, _, number = answer.partition(b" ")
         if kind == PID:
             self.pid = int(number)
         else:

@@ -36,15 +36,15 @@ def main(folder_path: str, template: int) -> int:
     end_with_parent(signal.SIGKILL)
     if os.getppid() != template:  # it died before the line above
         return STOPPED
-    received: list[int] = []
-    signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
+    signals: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: signals.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     path = Path(folder_path)
     job_id, _, attempt = path.name.rpartition(".")
     folder = JobFolder(path.parent.parent, job_id, int(attempt))
     with folder.lock.open("a") as lock:
         while not try_lock(lock):  # another worker's process may still be at it, or have finished
-            if received:
+            if signals:
                 return STOPPED
             time.sleep(_LOCK_POLL_S)
         lock.truncate(0)
@@ -57,7 +57,7 @@ def main(folder_path: str, template: int) -> int:
             return FOLDER_LOST
         let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
-        job_run = JobRun(folder, request, lambda: bool(received))
+        job_run = JobRun(folder, request, lambda: bool(signals))
         try:
             outcome = _outcome_of(job_run)
             folder.write_progress(outcome.progress)
@@ -84,8 +84,8 @@ def _outcome_of(job_run: JobRun) -> Outcome:
         raise
     except UltragrayError as error:
         field = error.field if isinstance(error, InvalidArgument) else None
-        given = f"{field}: " if field is not None and field not in error.detail else ""
-        return _failed(job_run, error.reason, given + error.detail)
+        prefix = f"{field}: " if field is not None and field not in error.detail else ""
+        return _failed(job_run, error.reason, prefix + error.detail)
     except Exception as error:
         if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
             return _failed(job_run, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
@@ -106,7 +106,7 @@ def _without_folders(text: str) -> str:
 
 
 def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:
-    shown = _without_folders(reason.replace(f"{job_run.folder.artifact_folder}{os.sep}", ""))
+    message = _without_folders(reason.replace(f"{job_run.folder.artifact_folder}{os.sep}", ""))
     with suppress(OSError):
-        sys.stderr.write(f"failed: {shown}\n")
-    return Outcome(error=error, reason=shown, progress=job_run.progress)
+        sys.stderr.write(f"failed: {message}\n")
+    return Outcome(error=error, reason=message, progress=job_run.progress)

@@ -219,16 +219,16 @@ class _JobAtHand:
     def _is_needed(self) -> bool:
         """Whether the batch of a share goes on; true of all other jobs."""
         batch = self._row.batch
-        found = None if batch is None else self._ask(lambda: queue.row_of(self._engine, batch))
-        return batch is None or (found is not None and not found.state.is_final)
+        row = None if batch is None else self._ask(lambda: queue.row_of(self._engine, batch))
+        return batch is None or (row is not None and not row.state.is_final)
 
     def _outcome(self) -> Outcome:
         folder, attempt = self._folder, self._row.attempt
         try:
             self._telling.take_over()
-            kept = folder.outcome()  # of a process that finished as its worker died
-            if kept is not None:
-                return replace(kept, attempts=attempt)
+            outcome = folder.outcome()  # of a process that finished as its worker died
+            if outcome is not None:
+                return replace(outcome, attempts=attempt)
             with self._telling.telling():
                 return self._work()
         except (JobStalled, JobTimeExceeded) as error:

@@ -120,12 +120,12 @@ class Telling:
 
     def remove_others(self) -> None:
         """Removes what counts no more of a job whose end is told: of earlier attempts and checkpoints."""
-        named, top = self._files.keys(), f"{FOLDER}/{self._row.id}"
+        keys, top = self._files.keys(), f"{FOLDER}/{self._row.id}"
         with contextlib.suppress(StorageUnavailable, OSError):
             for entry in list(self._storage.entries(top)):
                 is_of_attempt = "/" in entry.key.removeprefix(f"{top}/")
                 is_shard = entry.key.startswith(f"{batch_prefix(self._row.id)}/")
-                if is_of_attempt and not is_shard and entry.key not in named:
+                if is_of_attempt and not is_shard and entry.key not in keys:
                     self._storage.delete(entry.key)
             self._storage.delete_half_written(top)
 
@@ -142,12 +142,12 @@ class Telling:
                 self._watch()
                 wait([future], _LOOK_S)
             try:
-                found = future.result()
+                result = future.result()
             except StorageUnavailable as error:
                 self._note_away(error)
             else:
                 self._note_back()
-                return found
+                return result
             end_s = time.monotonic() + pause_s
             while time.monotonic() < end_s:
                 self._watch()
@@ -184,27 +184,27 @@ class Telling:
 
         Nobody has gone further than that folder says. Those of other attempts go, and processes that are left in them.
         """
-        found = False
+        is_found = False
         for other in self._folder.others():
             end_process_of_another_worker(other)
-            left = other.request()
-            if left is not None and left.submitted == self._row.number and other.attempt == self._row.attempt - 1:
+            request = other.request()
+            if request is not None and request.submitted == self._row.number and other.attempt == self._row.attempt - 1:
                 self._folder.remove()
                 other.path.rename(self._folder.path)
                 self._folder.remove_leftovers()
                 self._keep_untold_log()
-                found = True
+                is_found = True
             else:
                 other.remove()
-        return found
+        return is_found
 
     def _keep_untold_log(self) -> None:
         """Leaves in the log what the attempt before has not told: it counts as the beginning of this one's."""
         prefix = f"{FOLDER}/{self._row.id}/{self._row.number}-{self._row.attempt - 1}/"
-        told = sum(piece.bytes for piece in self._files.log if piece.key.startswith(prefix))
+        offset = sum(piece.bytes for piece in self._files.log if piece.key.startswith(prefix))
         with contextlib.suppress(FileNotFoundError):
-            left = self._folder.log.read_bytes()[told:]
-            self._folder.log.write_bytes(left)
+            rest = self._folder.log.read_bytes()[offset:]
+            self._folder.log.write_bytes(rest)
 
     def _fetch(self, files: Mapping[str, StoredFile], target: Path) -> None:
         """Copies files into a new folder, all of them or, where one is gone or damaged, none."""
@@ -247,11 +247,11 @@ class Telling:
     def _tell(self, *, is_last: bool) -> None:
         with self._telling:
             progress, before = self._folder.progress(), self._files
-            run = self._told_run(is_last=is_last)
+            run = self._new_run(is_last=is_last)
             files = replace(
                 before,
-                log=self._log.told(before.log, everything=is_last),
-                journal=self._journal.told((), everything=is_last),
+                log=self._log.pieces(before.log, everything=is_last),
+                journal=self._journal.pieces((), everything=is_last),
                 run=before.run if run is None else run,
             )
             if progress == self._progress and files == before:
@@ -260,12 +260,12 @@ class Telling:
                 raise Superseded
             self._files, self._progress = files, progress
             if run is not None:
-                kept = {one.key for one in (*run.values(), *before.run.values())}
-                for key in {one.key for one in self._older_run.values()} - kept:
+                keys = {one.key for one in (*run.values(), *before.run.values())}
+                for key in {one.key for one in self._older_run.values()} - keys:
                     self._storage.delete(key)
                 self._older_run = before.run
 
-    def _told_run(self, *, is_last: bool) -> dict[str, StoredFile] | None:
+    def _new_run(self, *, is_last: bool) -> dict[str, StoredFile] | None:
         """The files of a new checkpoint that are there whole; None: there is none since the last one."""
         uploaded: dict[str, StoredFile] | None = None
         if self._uploading is not None and (is_last or self._uploading.done()):
@@ -316,8 +316,8 @@ class Telling:
                     artifacts[name] = self._upload(path, f"artifacts/{name}", sha256)
             run: Mapping[str, StoredFile] = {}
             if outcome.error is not None:  # a retry goes on from it
-                run = self._told_run(is_last=True) or self._files.run
-            log = self._log.told(self._files.log, everything=True)
+                run = self._new_run(is_last=True) or self._files.run
+            log = self._log.pieces(self._files.log, everything=True)
             self._files = replace(self._files, log=log, run=run, artifacts=artifacts)
             return self._files
 
@@ -339,26 +339,26 @@ class _GrowingFile:
         self._write, self._path, self._key = write, path, key
         self._own: list[Piece] = []
 
-    def told(self, before: tuple[Piece, ...], *, everything: bool) -> tuple[Piece, ...]:
+    def pieces(self, before: tuple[Piece, ...], *, everything: bool) -> tuple[Piece, ...]:
         """The pieces `before` this attempt's, and this attempt's, of which new bytes have been written."""
         inherited = [piece for piece in before if not piece.key.startswith(f"{self._key}-")]
-        told, left = sum(piece.bytes for piece in self._own), MOST_BYTES
+        offset, budget = sum(piece.bytes for piece in self._own), MOST_BYTES
         with contextlib.suppress(FileNotFoundError), self._path.open("rb") as file:
-            if self._path.stat().st_size < told:  # a journal that was ahead of its checkpoint was cut
-                self._own, told = [], 0
-            while everything or left > 0:
+            if self._path.stat().st_size < offset:  # a journal that was ahead of its checkpoint was cut
+                self._own, offset = [], 0
+            while everything or budget > 0:
                 is_full = not self._own or self._own[-1].bytes >= PIECE_BYTES
-                begin = told if is_full else told - self._own[-1].bytes
+                begin = offset if is_full else offset - self._own[-1].bytes
                 file.seek(begin)
                 data = file.read(PIECE_BYTES)
-                if begin + len(data) == told:
+                if begin + len(data) == offset:
                     break
                 number = len(self._own) if is_full else len(self._own) - 1
                 piece = Piece(f"{self._key}-{number:05d}", len(data))
                 self._write(piece.key, data)
                 self._own[number:] = [piece]
-                left -= begin + len(data) - told
-                told = begin + len(data)
+                budget -= begin + len(data) - offset
+                offset = begin + len(data)
         return (*inherited, *self._own)
 
 
@@ -382,12 +382,12 @@ def copy_run(run: Path, version: _Version, target: Path) -> bool:
 
 def _version_of(run: Path) -> _Version:
     """The version of a run; empty where there is nothing to go on from."""
-    found = {}
+    times_ns = {}
     for path in _run_files(run):
         if not _is_beside(path):
             with contextlib.suppress(FileNotFoundError):  # replaced or removed meanwhile
-                found[path.relative_to(run).as_posix()] = path.stat().st_mtime_ns
-    return found
+                times_ns[path.relative_to(run).as_posix()] = path.stat().st_mtime_ns
+    return times_ns
 
 
 def _run_files(folder: Path) -> Iterator[Path]:

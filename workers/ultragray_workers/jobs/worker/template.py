@@ -45,8 +45,8 @@ def main(descriptor: str) -> NoReturn:
         if pid == 0:
             requests.close()
             _do_job(json.loads(content), log, answers, template)
-        for kept in (log, lock):
-            os.close(kept)
+        for file in (log, lock):
+            os.close(file)
         ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
         assert ended is not None
         code = ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status

@@ -164,9 +164,9 @@ def claim_name(artifact_folder: Path, name: str | None, *, host_of_its_own: bool
 
 def _host_id(folder: Path) -> str:
     """The id of this host among those that share a storage, the same after a restart."""
-    kept = LocalStorage(folder)
-    kept.write(_HOST_ID_FILE, secrets.token_hex(3).encode(), if_absent=True)
-    return kept.read(_HOST_ID_FILE).decode("ascii")
+    storage = LocalStorage(folder)
+    storage.write(_HOST_ID_FILE, secrets.token_hex(3).encode(), if_absent=True)
+    return storage.read(_HOST_ID_FILE).decode("ascii")
 
 
 INTERVAL_S = 3600.0
@@ -223,8 +223,8 @@ class Housekeeper:
 
     def _remove_unknown(self, ids: Iterable[str], remove: Callable[[str], None]) -> int:
         """Removes what there is of jobs that the queue does not know."""
-        removed, left = 0, iter([job_id for job_id in ids if _JOB_ID.fullmatch(job_id)])
-        while not self._stop.is_set() and (some := list(islice(left, AT_ONCE))):
+        removed, rest = 0, iter([job_id for job_id in ids if _JOB_ID.fullmatch(job_id)])
+        while not self._stop.is_set() and (some := list(islice(rest, AT_ONCE))):
             for job_id in set(some) - queue.known_ids(self._engine, some):
                 remove(job_id)
                 removed += 1
