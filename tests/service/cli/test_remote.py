@@ -133,8 +133,10 @@ def test_a_recording_is_shown_and_becomes_a_dataset_or_is_given_up(server, tmp_p
     assert finished == "recorded kept: 8 training and 2 held-out frames\n"
     assert json.loads(done(server, "datasets", "show", "kept", "--json"))["train_frames"] == 8
     assert done(server, "recordings", "delete", "given-up") == "given-up deleted\n"
-    for command in ("show", "finish", "delete"):
+    assert done(server, "recordings", "finish", "kept") == finished  # for who did not hear the answer
+    for command in ("show", "delete"):
         assert "there is no open recording 'kept'" in refused(server, "recordings", command, "kept")
+    for command in ("show", "finish", "delete"):
         assert "there is no dataset 'given-up'" in refused(server, "recordings", command, "given-up")
     done(server, "datasets", "delete", "kept")
 
