@@ -24,6 +24,7 @@ from ultragray.contract import Contract, described, from_dict
 from ultragray.datasets.clocks import LONGEST_STEP_S, MAX_GAP_NS, NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns, times_of_all
 from ultragray.datasets.fan import tracked_sweep
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
+from ultragray.datasets.source import advice_for
 from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import FloatArray
@@ -378,7 +379,9 @@ def _pictures(folder: Path, named: str | None) -> list[Path]:
         if path.suffix.lower() in PICTURES and path.is_file() and not _is_hidden(path.relative_to(folder)):
             found.setdefault(path.parent, []).append(path)
     if not found:
-        raise DatasetInvalid(f"{folder}: it holds no pictures ({', '.join(PICTURES)})")
+        raise DatasetInvalid(
+            f"{folder}: it holds no pictures ({', '.join(PICTURES)}){advice_for(sorted(folder.iterdir()))}"
+        )
     with_named = {
         place for place, them in found.items() for path in them if named in (path.name, str(path.relative_to(folder)))
     }

@@ -349,6 +349,15 @@ def test_pictures_named_by_times_are_in_their_order_or_refused(write):
         load_dataset(folder)
 
 
+def test_a_video_in_place_of_pictures_is_told_what_to_do_with(write):
+    folder = write(NAMES, WHOLE, pictures="images")
+    for picture in (folder / "images").iterdir():
+        picture.unlink()
+    (folder / "sweep.avi").write_bytes(b"RIFF")
+    with pytest.raises(DatasetInvalid, match=r"it holds no pictures .*; sweep\.avi is not read as it is: write its"):
+        load_dataset(folder)
+
+
 def test_pictures_of_several_folders_are_never_mixed_up(write):
     rows = table(TIMES, PLACES, quaternions())
     folder = write(NAMES, rows, pictures="images")
