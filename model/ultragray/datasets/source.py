@@ -206,7 +206,9 @@ def find_source(folder: Path) -> FoundSource:
     ]
     if not ranked:
         expected = " or ".join(one.upload_meaning for one in formats)
-        raise DatasetInvalid(f"{folder} must hold {expected}; it holds {_listed(plain) or 'no files'}{advice_for(plain)}")
+        raise DatasetInvalid(
+            f"{folder} must hold {expected}; it holds {_listed(plain) or 'no files'}{advice_for(plain)}"
+        )
     least = min(rank for rank, _, _ in ranked)
     sources = [(one, path) for rank, one, path in ranked if rank == least]
     if len(sources) > 1:

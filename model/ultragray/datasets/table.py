@@ -21,7 +21,16 @@ import cv2
 import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
-from ultragray.datasets.clocks import LONGEST_STEP_S, MAX_GAP_NS, NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns, times_of_all
+from ultragray.datasets.clocks import (
+    LONGEST_STEP_S,
+    MAX_GAP_NS,
+    NS_PER_S,
+    BoolArray,
+    PoseTrack,
+    delay_note,
+    parse_delay_ns,
+    times_of_all,
+)
 from ultragray.datasets.fan import tracked_sweep
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.datasets.source import advice_for
@@ -358,8 +367,8 @@ def _matched(
     if taken_s.max() < rows_s.min() or rows_s.max() < taken_s.min():
         raise DatasetInvalid(
             f"{table.path}: none of {len(pictures)} pictures has a pose: pictures are of {taken_s.min():.3f} to "
-            f"{taken_s.max():.3f} s, rows of {rows_s.min():.3f} to {rows_s.max():.3f} s: were the clocks other ones, or "
-            "is a unit wrong?"
+            f"{taken_s.max():.3f} s, rows of {rows_s.min():.3f} to {rows_s.max():.3f} s: were the clocks other "
+            "ones, or is a unit wrong?"
         )
     found, known = track.at(_nanoseconds(image_times_s, times_s) - delay_ns)
     return pictures, found, known, image_times_s, notes
@@ -388,10 +397,10 @@ def _pictures(folder: Path, named: str | None) -> list[Path]:
     places = sorted(with_named or found)
     if len(places) > 1 and folder not in places:
         listed = ", ".join(place.name for place in places[:5])
-        raise DatasetInvalid(f"{folder}: pictures lie in several folders, {listed}: name them as FOLDER/NAME in a column file")
-    return sorted(
-        found[places[0]], key=lambda path: [int(one) if one.isdigit() else one for one in _parts(path.name)]
-    )
+        raise DatasetInvalid(
+            f"{folder}: pictures lie in several folders, {listed}: name them as FOLDER/NAME in a column file"
+        )
+    return sorted(found[places[0]], key=lambda path: [int(one) if one.isdigit() else one for one in _parts(path.name)])
 
 
 def _is_hidden(path: Path) -> bool:

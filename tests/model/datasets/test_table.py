@@ -364,7 +364,9 @@ def test_pictures_of_several_folders_are_never_mixed_up(write):
     (folder / "annotations").mkdir()
     for number, frame in enumerate(FRAMES):
         cv2.imwrite(str(folder / "annotations" / f"frame_{number}.png"), 255 - frame)
-    with pytest.raises(DatasetInvalid, match="pictures lie in several folders, annotations, images: name them as FOLDER"):
+    with pytest.raises(
+        DatasetInvalid, match="pictures lie in several folders, annotations, images: name them as FOLDER"
+    ):
         load_dataset(folder)
     named = [[*row, f"images/frame_{number}.png"] for number, row in enumerate(rows)]
     check(write(NAMES + ",file", named, pictures="images"))
@@ -389,7 +391,10 @@ def test_a_picture_beside_the_folder_of_pictures_and_hidden_files_are_none_of_th
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        (1.7e9 + TIMES, r"none of 12 pictures has a pose: pictures are of 1700000003\.000 to .* s, rows of 3\.000 to 3\.5"),
+        (
+            1.7e9 + TIMES,
+            r"none of 12 pictures has a pose: pictures are of 1700000003\.000 to .* s, rows of 3\.000 to 3\.5",
+        ),
         (1.7e12 + 1000 * TIMES, "were the clocks other ones, or is a unit wrong"),
         (["2026-03-01T10:00:00"] * COUNT, "row 2: time_s must be a number, got '2026-03-01T10:00:00': write dates"),
     ],
