@@ -159,8 +159,8 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
         found = [f"{name}: {text}" for name, report in reports.items() for text in report.warnings]
     if delay is not None:
         found.append(
-            f"images seem to come {delay.delay_ms:.0f} ms {'after' if delay.delay_ms > 0 else 'before'} their poses: "
-            f"path and pictures fit so ({delay.unexplained:.0%} unexplained, {delay.without:.0%} without): "
+            f"images seem to come {abs(delay.delay_ms):.0f} ms {'after' if delay.delay_ms > 0 else 'before'} their "
+            f"poses: path and pictures fit so ({delay.unexplained:.0%} unexplained, {delay.without:.0%} without): "
             f"--image-delay-ms {delay.delay_ms:.0f} corrects it"
         )
     found_path = agreed_path(dataset)
@@ -480,7 +480,10 @@ def _hardly_moved(sweep: Sweep) -> list[str]:
         return [f"{found} and turn by {turn_deg:.0f}°: a probe tilted in place, or positions not in millimetres?"]
     if travel_mm < pixel_mm:
         return [f"{found}, less than a pixel ({pixel_mm:.2g} mm): tracking stalled, or positions in metres?"]
-    return [f"{found}, where scan lines are {sweep.probe.scan_line_length_mm:.0f} mm long: positions in centimetres?"]
+    return [
+        f"{found}, where scan lines are {sweep.probe.scan_line_length_mm:.0f} mm long: positions in "
+        "centimetres or metres?"
+    ]
 
 
 def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:

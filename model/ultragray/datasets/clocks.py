@@ -21,6 +21,7 @@ from ultragray.geometry.rotations import blended
 from ultragray.learn.sweep import IntArray, frame_list
 
 NS_PER_S, NS_PER_MS = 1_000_000_000, 1_000_000
+LONGEST_STEP_S = 2.0  # from one frame or row to the next: numbers that go further are no seconds
 MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time
 LEAST_TO_AND_FRO, SMALLEST_TO_AND_FRO_MM = 8, 1.0
 MAX_DELAY_MS = 1e12  # a clock that was never set is decades off
@@ -122,8 +123,11 @@ def poses_before(
 
 
 def clock_warnings(times_s: FloatArray, numbers: IntArray) -> Iterator[str]:  # [F] both
-    """Steps back and stamps that come twice."""
+    """Steps back, stamps that come twice, and steps too long for seconds."""
     steps = np.diff(times_s)
+    usual_s = float(np.median(steps / np.diff(numbers).clip(min=1))) if len(steps) else 0.0
+    if usual_s > LONGEST_STEP_S:
+        yield f"the time goes on by {usual_s:.6g} s from frame to frame: another unit, where seconds are expected?"
     if len(back := np.flatnonzero(steps < 0)):
         yield (
             f"the time steps back at frame {frame_list(numbers[back + 1])}, by up to {-steps.min() * 1000:.6g} ms: "
@@ -143,6 +147,7 @@ MAX_LAG_S, LAG_STEP_S = 0.5, 0.01
 BINS = 40
 LEAST_FRAMES, MAX_FRAMES = 20, 240
 CLEAR = 0.75  # of what is unexplained without a delay, and at the usual one: less tells one
+LEAST_GAIN = 0.04  # of the variance: tissue that changes faster here than there gains less by a false delay
 
 
 @dataclass(frozen=True)
@@ -188,7 +193,9 @@ def estimate_delay(
         unexplained[place] = (second_sums - sums**2 / counts).sum() / (len(first) * variance)
     best, none = int(unexplained.argmin()), len(lags) // 2
     usual_s = float(np.median(np.diff(times_s)))
-    is_clear = unexplained[best] < CLEAR * min(unexplained[none], float(np.median(unexplained)))
+    is_clear = unexplained[best] < min(
+        CLEAR * min(unexplained[none], float(np.median(unexplained))), unexplained[none] - LEAST_GAIN
+    )
     if best in (0, len(lags) - 1) or not is_clear:
         return None
     before, here, after = unexplained[best - 1 : best + 2]

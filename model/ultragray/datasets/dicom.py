@@ -45,6 +45,7 @@ from ultragray.rendering.display import Display
 POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels
 DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole data set is compressed: it could inflate without bounds
+VIDEO = "1.2.840.10008.1.2.4.10"  # MPEG-2, MPEG-4 and HEVC: what these numbers begin with
 JPEG = ("1.2.840.10008.1.2.4.50", "1.2.840.10008.1.2.4.51")  # baseline, extended
 CENTIMETRES, TISSUE_2D, TISSUE = 3, 1, 1
 GREY, RGB, YBR = (
@@ -204,7 +205,13 @@ def _read_header(path: Path) -> Any:
         import pydicom
         from pydicom.filereader import read_file_meta_info
 
-        if read_file_meta_info(path).get("TransferSyntaxUID", "") == DEFLATED:
+        syntax = read_file_meta_info(path).get("TransferSyntaxUID", "")
+        if syntax.startswith(VIDEO):
+            raise DatasetInvalid(
+                f"{path}: its pixels are a video ({syntax.name}), which is not read: write its frames as pictures "
+                "beside a poses.csv"
+            )
+        if syntax == DEFLATED:
             raise DatasetInvalid(f"{path}: its data set is deflated, which is not read: save it in another syntax")
         with _BoundedFile(path) as file:
             return pydicom.dcmread(file, stop_before_pixels=True)
@@ -479,7 +486,9 @@ def _read_frames(
         except NotImplementedError:
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
         if decoder is not None and not decoder.is_available:
-            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: install python-gdcm")
+            is_for_gdcm = any("gdcm" in one for one in decoder.missing_dependencies)
+            advice = "install python-gdcm" if is_for_gdcm else "save the file without compression"
+            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: {advice}")
         surplus = max(0, bits - 8)
         if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(

@@ -347,6 +347,11 @@ def _steps(
     for world in WORLDS:
         if way := find_path(sources, pixels, world):
             return tuple(way)
+    if not any(key.endswith(_TRANSFORM) for fields in stored.frame_fields for key in fields):
+        raise DatasetInvalid(
+            f"{stored.path}: its frames have no transforms: 3D Slicer saves images and transforms apart, PLUS and "
+            "SlicerIGSIO in one sequence file (.igs.mha), which is needed"
+        )
     is_calibrated = any(part.endswith(IMAGE) for name in sources for part in name)
     reached = {frame for name in sources for frame in name if find_path(sources, pixels, frame)}
     goes_on = any({*name} <= reached and not any(part.endswith(IMAGE) for part in name) for name in sources)

@@ -6,7 +6,7 @@ package adds a format of its own by an entry point of the group `ultragray.datas
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from importlib.metadata import EntryPoint, entry_points
@@ -181,7 +181,7 @@ def format_of(source: str | Path) -> DatasetFormat:
     if not path.is_file():
         raise DatasetInvalid(f"{path}: no such file or folder")
     *meanings, last = (one.meaning for one in FORMATS.values())
-    raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}")
+    raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}{advice_for([path])}")
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,9 @@ def find_source(folder: Path) -> FoundSource:
     ]
     if not ranked:
         expected = " or ".join(one.upload_meaning for one in formats)
-        raise DatasetInvalid(f"{folder} must hold {expected}; it holds {_listed(plain) or 'no files'}")
+        raise DatasetInvalid(
+            f"{folder} must hold {expected}; it holds {_listed(plain) or 'no files'}{advice_for(plain)}"
+        )
     least = min(rank for rank, _, _ in ranked)
     sources = [(one, path) for rank, one, path in ranked if rank == least]
     if len(sources) > 1:
@@ -220,6 +222,15 @@ def find_source(folder: Path) -> FoundSource:
         if matching:
             companions[option] = folder / matching[0]
     return FoundSource(found, folder / source, companions)
+
+
+def advice_for(paths: Iterable[PurePath]) -> str:
+    """What to do with the first of the files that is in a format of other programs, after a semicolon; else nothing."""
+    for path in paths:
+        for pattern, advice in OTHER_FORMATS.items():
+            if fnmatchcase(path.name.lower(), pattern):
+                return f"; {path.name} is not read as it is: {advice}"
+    return ""
 
 
 def _listed(paths: list[Path]) -> str:
@@ -304,6 +315,21 @@ FORMATS: Mapping[str, DatasetFormat] = {
         ),
         *(point.load() for point in entry_points(group="ultragray.dataset_formats")),
     )
+}
+# What people have and no reader takes, and what to do with it.
+OTHER_FORMATS: Mapping[str, str] = {
+    **dict.fromkeys(
+        ("*.bag", "*.db3"), "make an .mcap of it, by `ros2 bag convert` or `rosbags-convert --dst-storage mcap`"
+    ),
+    **dict.fromkeys(
+        ("*.mp4", "*.avi", "*.mov", "*.mkv", "*.wmv"),
+        "write its frames as pictures (`ffmpeg -i VIDEO frame_%05d.png`) beside a poses.csv and an images.csv",
+    ),
+    **dict.fromkeys(("*.zip", "*.mrb", "*.tar", "*.tgz", "*.tar.gz", "*.7z"), "unpack it"),
+    **dict.fromkeys(
+        ("*.mat", "*.npz", "*.npy", "*.hdf5"), "write its arrays as .npy files of a folder with a conf.json"
+    ),
+    "transforms*.json": "write its poses into a poses.csv, and from pixels to the sensor a calibration.json",
 }
 UPLOADED_FORMATS = tuple(one for one in FORMATS.values() if one.files)
 COMPANIONS = tuple(dict.fromkeys(option for one in UPLOADED_FORMATS for option in one.companions))

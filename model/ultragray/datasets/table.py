@@ -21,9 +21,19 @@ import cv2
 import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
-from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns, times_of_all
+from ultragray.datasets.clocks import (
+    LONGEST_STEP_S,
+    MAX_GAP_NS,
+    NS_PER_S,
+    BoolArray,
+    PoseTrack,
+    delay_note,
+    parse_delay_ns,
+    times_of_all,
+)
 from ultragray.datasets.fan import tracked_sweep
 from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
+from ultragray.datasets.source import advice_for
 from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import FloatArray
@@ -47,7 +57,6 @@ _QUATERNIONS = (
 _EULER = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
 _BRACKETS = re.compile(r"\s*[\[(](.*)[\])]$")  # around a unit: "x [mm]"
 NO_NUMBER = ("", "null", "nan", "na", "n/a", "none", "-", "--", "missing")  # cells of a row without a pose
-LONGEST_STEP_S = 2.0  # from row to row: times without a unit that go further are no seconds
 
 
 @dataclass(frozen=True)
@@ -92,11 +101,13 @@ def read_table_sweep(
     count = len(pictures)
     numbers = np.arange(count) if frames is None else np.array(parse_frame_ranges(frames, count, option="frames"))
     left_out, numbers = numbers[~has_pose[numbers]], numbers[has_pose[numbers]]
+    is_between = delay_ns != 0 or (folder / TIMES).is_file()
+    pose = f"pose between rows at most {MAX_GAP_NS / 1e6:g} ms apart" if is_between else "pose"
     if not len(numbers):
-        raise DatasetInvalid(f"{table_path}: none of {count} pictures has a pose")
+        raise DatasetInvalid(f"{table_path}: none of {count} pictures has a {pose}")
     notes = (*angle_notes, *left_notes, *delay_note(delay_ns))
     if len(left_out):
-        notes += (f"pictures without a pose were left out: {frame_list(left_out)} ({len(left_out)} in all)",)
+        notes += (f"pictures without a {pose} were left out: {frame_list(left_out)} ({len(left_out)} in all)",)
     calibration_name = (calibration or folder / CALIBRATION).name
     chain = Chain(
         (
@@ -200,13 +211,18 @@ class _Table:
     def values(self, places: Sequence[int]) -> FloatArray:  # [N, K]; a cell of NO_NUMBER is NaN
         found = np.full((len(self.rows), len(places)), np.nan)
         for number, row in enumerate(self.rows):
-            try:
-                cells = [row[place].strip() if place < len(row) else "" for place in places]
-                if self.has_decimal_commas:
-                    cells = [cell.replace(",", ".") for cell in cells]
-                found[number] = [np.nan if cell.lower() in NO_NUMBER else float(cell) for cell in cells]
-            except ValueError:
-                raise DatasetInvalid(f"{self.path}: row {number + 2}: it must have numbers, got {row!r:.80}") from None
+            for column, place in enumerate(places):
+                cell = row[place].strip() if place < len(row) else ""
+                if cell.lower() in NO_NUMBER:
+                    continue
+                try:
+                    found[number, column] = float(cell.replace(",", ".") if self.has_decimal_commas else cell)
+                except ValueError:
+                    name = next(name for name, at in self.columns.items() if at == place)
+                    hint = ": write dates and hours as seconds" if ":" in cell else ""
+                    raise DatasetInvalid(
+                        f"{self.path}: row {number + 2}: {name} must be a number, got {cell[:40]!r}{hint}"
+                    ) from None
         return found
 
     def texts(self, names: Sequence[str]) -> list[str] | None:
@@ -315,14 +331,14 @@ def _matched(
 ) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None, tuple[str, ...]]:
     """The pictures, the pose of each and whether it is known, their times, and which pictures have no row."""
     notes: tuple[str, ...] = ()
-    pictures = _pictures(folder)
-    by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
     stamped = _Table.read(folder / TIMES) if (folder / TIMES).is_file() else None
     files = (stamped or table).texts(_FILE)
+    paths = [str(PurePosixPath(name.replace("\\", "/"))) for name in files or ()]  # also ./a.png and images\a.png
+    pictures = _pictures(folder, paths[0] if paths else None)
+    by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
     if files is None:
         _check_order(folder, pictures)
     else:
-        paths = [str(PurePosixPath(name.replace("\\", "/"))) for name in files]  # also ./a.png and images\a.png
         if missing := [name for name, where in zip(files, paths, strict=True) if where not in by_name]:
             raise DatasetInvalid(f"{(stamped or table).path}: the picture {missing[0][:80]!r} was not found beside it")
         named = [by_name[where] for where in paths]
@@ -347,6 +363,13 @@ def _matched(
     if not len(places):
         raise DatasetInvalid(f"{table.path}: none of its rows has a pose and a time")
     track = PoseTrack(times_ns, poses[usable][places])
+    taken_s, rows_s = image_times_s - delay_ns / NS_PER_S, times_s[usable]
+    if taken_s.max() < rows_s.min() or rows_s.max() < taken_s.min():
+        raise DatasetInvalid(
+            f"{table.path}: none of {len(pictures)} pictures has a pose: pictures are of {taken_s.min():.3f} to "
+            f"{taken_s.max():.3f} s, rows of {rows_s.min():.3f} to {rows_s.max():.3f} s: were the clocks other "
+            "ones, or is a unit wrong?"
+        )
     found, known = track.at(_nanoseconds(image_times_s, times_s) - delay_ns)
     return pictures, found, known, image_times_s, notes
 
@@ -355,13 +378,34 @@ def _nanoseconds(times_s: FloatArray, all_s: FloatArray) -> IntArray:
     return np.round((times_s - np.nanmin(all_s)) * NS_PER_S).astype(np.int64)
 
 
-def _pictures(folder: Path) -> list[Path]:
-    """Those in the folder, or in its one folder of pictures, in the order of the numbers in their names."""
-    for place in (folder, *sorted(one for one in folder.iterdir() if one.is_dir())):
-        found = [path for path in place.iterdir() if path.suffix.lower() in PICTURES and path.is_file()]
-        if found:
-            return sorted(found, key=lambda path: [int(one) if one.isdigit() else one for one in _parts(path.name)])
-    raise DatasetInvalid(f"{folder}: it holds no pictures ({', '.join(PICTURES)})")
+def _pictures(folder: Path, named: str | None) -> list[Path]:
+    """Those in the folder, else in its one folder of pictures, in the order of the numbers in their names.
+
+    Of several folders it is the one that holds the picture `named`. Raises DatasetInvalid where that is not one.
+    """
+    found: dict[Path, list[Path]] = {}
+    for path in (*folder.iterdir(), *folder.glob("*/*")):
+        if path.suffix.lower() in PICTURES and path.is_file() and not _is_hidden(path.relative_to(folder)):
+            found.setdefault(path.parent, []).append(path)
+    if not found:
+        raise DatasetInvalid(
+            f"{folder}: it holds no pictures ({', '.join(PICTURES)}){advice_for(sorted(folder.iterdir()))}"
+        )
+    with_named = {
+        place for place, them in found.items() for path in them if named in (path.name, str(path.relative_to(folder)))
+    }
+    places = sorted(with_named or found)
+    if len(places) > 1 and folder not in places:
+        listed = ", ".join(place.name for place in places[:5])
+        raise DatasetInvalid(
+            f"{folder}: pictures lie in several folders, {listed}: name them as FOLDER/NAME in a column file"
+        )
+    return sorted(found[places[0]], key=lambda path: [int(one) if one.isdigit() else one for one in _parts(path.name)])
+
+
+def _is_hidden(path: Path) -> bool:
+    """Whether it is of the files that a file system or an archiver leaves beside others, such as ._frame_0.png."""
+    return any(part.startswith((".", "__MACOSX")) for part in path.parts)
 
 
 def _check_order(folder: Path, pictures: Sequence[Path]) -> None:

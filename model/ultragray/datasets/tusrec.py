@@ -124,10 +124,12 @@ def _read_scan(path: Path, frames: str | None) -> tuple[np.ndarray, FloatArray, 
             if not count:
                 raise DatasetInvalid(f"{path}: it holds no frames, its frames are {list(images.shape)}")
             numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
-            if images.dtype != np.uint8 or images.size * len(numbers) > MAX_PIXEL_BYTES * count:
+            if images.dtype != np.uint8:
+                raise DatasetInvalid(f"{path}: frames must be uint8, got {images.dtype} {list(images.shape)}")
+            if images.size * len(numbers) > MAX_PIXEL_BYTES * count:
                 raise DatasetInvalid(
-                    f"{path}: frames must be uint8 of at most {MAX_PIXEL_BYTES >> 30} GiB, got {images.dtype} "
-                    f"{list(images.shape)}: choose some with frames"
+                    f"{path}: frames must have at most {MAX_PIXEL_BYTES >> 30} GiB, got {list(images.shape)}: choose "
+                    "some with frames"
                 )
             chosen = slice(None) if frames is None else numbers
             return images[chosen], np.asarray(tforms[chosen], np.float64), count

@@ -125,11 +125,17 @@ class Sweep:
         if len(self.poses) != count or len(self.frame_numbers) != count:
             raise DatasetInvalid(f"{self.source}: it holds {count} images but {len(self.poses)} poses")
         object.__setattr__(self, "poses", check_frame_poses(self.poses, self.frame_numbers, self.source))
-        for number, image in zip(self.frame_numbers, images, strict=True):
-            if image.min() == image.max():
-                raise DatasetInvalid(
-                    f"{self.source}: frame {number} is constant: every pixel is {image.min()}; leave it out"
-                )
+        constant = [place for place, image in enumerate(images) if image.min() == image.max()]
+        if len(constant) == 1:
+            raise DatasetInvalid(
+                f"{self.source}: frame {self.frame_numbers[constant[0]]} is constant: every pixel is "
+                f"{images[constant[0]].min()}; leave it out"
+            )
+        if constant:
+            raise DatasetInvalid(
+                f"{self.source}: frames {frame_list(self.frame_numbers[constant])} are constant, as of a probe that "
+                "was lifted off; leave them out"
+            )
 
     def __len__(self) -> int:
         return len(self.images)

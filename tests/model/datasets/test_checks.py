@@ -290,7 +290,7 @@ def test_a_probe_in_other_units_is_named(make_sweep, probe, told):
     [
         (1.0, 0.0, None),
         (1.0, 30.0, None),
-        (0.1, 0.0, "lie within 3.9 mm, where scan lines are 50 mm long: positions in centimetres?"),
+        (0.1, 0.0, "lie within 3.9 mm, where scan lines are 50 mm long: positions in centimetres or metres?"),
         (0.001, 0.0, "lie within 0.039 mm, less than a pixel (2.5 mm): tracking stalled, or positions in metres?"),
         (0.001, 30.0, "lie within 0.039 mm and turn by 30°: a probe tilted in place, or positions not in millimetres?"),
     ],

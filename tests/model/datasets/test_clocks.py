@@ -73,7 +73,22 @@ def test_the_delay_of_the_images_is_told_with_its_number(motion, delay_ms):
     assert report.image_delay_ms == pytest.approx(delay_ms, abs=12)
     (told,) = (text for text in report.warnings if "--image-delay-ms" in text)
     assert f"--image-delay-ms {report.image_delay_ms:.0f} corrects it" in told
-    assert ("after their poses" if delay_ms > 0 else "before their poses") in told
+    where = "after" if delay_ms > 0 else "before"
+    assert f"seem to come {abs(report.image_delay_ms):.0f} ms {where} their poses" in told
+
+
+@pytest.mark.usefixtures("quick_checks")
+@pytest.mark.parametrize("resting_frames", [12, 15, 18])
+def test_no_delay_is_told_of_a_probe_that_rests_before_tissue_that_changes_ever_faster(resting_frames):
+    times_s = np.arange(resting_frames + 40) / RATE_HZ
+    places_mm = 0.5 * np.maximum(np.arange(len(times_s)) - resting_frames, 0)
+    poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+    poses[:, 1, 3] = places_mm
+    across = np.linspace(0, 6, 36)[None, None, :] + 2e-4 * (places_mm[:, None, None] + 20) ** 2.2
+    images = 120 + 80 * np.sin(across + np.linspace(0, 3, 48)[None, :, None])
+    images += np.random.default_rng(0).normal(0, 2, images.shape)
+    sweep = Sweep(np.clip(images, 1, 255).astype(np.uint8), poses, PROBE, np.arange(len(poses)), "it", times_s=times_s)
+    assert report_of(sweep).image_delay_ms is None
 
 
 @pytest.mark.usefixtures("quick_checks")
@@ -89,6 +104,9 @@ def test_steps_back_and_stamps_that_come_twice():
         "frames 15 have the time of the frame before: stamps that come twice",
     ]
     assert list(clock_warnings(np.arange(5) / 10, np.arange(5))) == []
+    assert list(clock_warnings(np.arange(5) * 50.0, np.arange(5))) == [
+        "the time goes on by 50 s from frame to frame: another unit, where seconds are expected?"
+    ]
 
 
 def moving(seconds):

@@ -117,7 +117,10 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
             r"columns and rows 4:34,2:22, does not lie within 32 x 24",
         ),
         ({"SequenceOfUltrasoundRegions": None, "PixelSpacing": [0.1]}, r"it cannot be read as DICOM"),
-        ({"syntax": UID("1.2.840.10008.1.2.4.100"), "data": COMPRESSED}, r"compressed as .* cannot be read"),
+        (
+            {"syntax": UID("1.2.840.10008.1.2.4.100"), "data": COMPRESSED},
+            r"its pixels are a video \(MPEG2 .*: write its frames as",
+        ),
         (
             {"syntax": JPEGBaseline8Bit, "data": COMPRESSED},
             r"sweep\.dcm: (frame 0: it cannot be read|.* need a decoder)",
@@ -138,6 +141,13 @@ def test_a_decoder_that_is_not_installed_is_named(write, monkeypatch):
     monkeypatch.setattr(Decoder, "is_available", False)
     with pytest.raises(DatasetInvalid, match=r"compressed as JPEG Lossless.* cannot be read: install python-gdcm"):
         load_dataset(write(syntax=JPEGLosslessSV1, data=COMPRESSED))
+
+
+def test_a_format_that_no_decoder_of_ours_reads_names_none(write):
+    with pytest.raises(
+        DatasetInvalid, match=r"High-Throughput JPEG 2000 .* cannot be read: save the file without comp"
+    ):
+        load_dataset(write(syntax=UID("1.2.840.10008.1.2.4.201"), data=COMPRESSED))
 
 
 def test_files_that_are_no_dicom(tmp_path, write):

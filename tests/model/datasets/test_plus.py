@@ -174,7 +174,9 @@ def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
     refused("UltrasoundImageOrientation must be", {"UltrasoundImageOrientation": "AMF"})
     constant = stored.copy()
     constant[1] = 3
-    refused("frame 1 is constant", {}, constant)
+    refused("frame 1 is constant: every pixel is 3; leave it out", {}, constant)
+    constant[0] = 0
+    refused("frames 0, 1 are constant, as of a probe that was lifted off; leave them out", {}, constant)
     refused(
         "none of its 3 frames has a valid ProbeToTracker",
         {f"Seq_Frame{frame:04d}_ProbeToTrackerTransformStatus": "INVALID" for frame in range(3)},
@@ -186,9 +188,14 @@ def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
         read_plus_sweep(path)
-    path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
+    other = {f"Seq_Frame{frame:04d}_needleToTrackerTransform": plus_files.numbers(np.eye(4)) for frame in range(3)}
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, other)
     with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(Image leads to Probe alone: has the"):
         read_plus_sweep(path, device_set=device_set)
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
+    for known in (None, device_set):
+        with pytest.raises(DatasetInvalid, match=r"s\.mha: its frames have no transforms: 3D Slicer saves images and"):
+            read_plus_sweep(path, device_set=known)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):
         read_plus_sweep(path, device_set=device_set, crop="0:21,0:30")

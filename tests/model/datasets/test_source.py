@@ -76,6 +76,18 @@ def test_sources_that_are_none_are_refused(folder, tmp_path):
     (tmp_path / "a.txt").write_text("")
     with pytest.raises(DatasetInvalid, match=r"a\.txt: a dataset is a folder with conf\.json"):
         load_dataset(tmp_path / "a.txt")
+    for name, advice in (
+        ("a.bag", r"a\.bag is not read as it is: make an \.mcap of it, by `ros2 bag convert`"),
+        ("sweep.mp4", r"sweep\.mp4 is not read as it is: write its frames as pictures \(`ffmpeg -i"),
+        ("scene.mrb", r"scene\.mrb is not read as it is: unpack it"),
+        ("us.mat", r"us\.mat is not read as it is: write its arrays as \.npy files of a folder with a conf\.json"),
+    ):
+        place = tmp_path / f"of {name}"
+        place.mkdir()
+        (place / name).write_bytes(b"")
+        for source in (place / name, place):
+            with pytest.raises(DatasetInvalid, match=f"(a dataset is|must hold) a folder with conf.*; {advice}"):
+                load_dataset(source)
     for options in (SourceOptions(crop="0:1,0:1"), SourceOptions(frames="0"), SourceOptions(device_set=folder)):
         takers = r"PLUS sequences(, DICOM cine loops, MCAP recordings, pose tables and TUS-REC scans)?"
         with pytest.raises(InvalidArgument, match=rf"is for {takers}, tiny is none"):

@@ -347,3 +347,68 @@ def test_pictures_named_by_times_are_in_their_order_or_refused(write):
     (folder / "us_3.50.png").rename(folder / "us_3.5.png")
     with pytest.raises(DatasetInvalid, match="the order of its pictures cannot be told from names such as us_3"):
         load_dataset(folder)
+
+
+def test_a_video_in_place_of_pictures_is_told_what_to_do_with(write):
+    folder = write(NAMES, WHOLE, pictures="images")
+    for picture in (folder / "images").iterdir():
+        picture.unlink()
+    (folder / "sweep.avi").write_bytes(b"RIFF")
+    with pytest.raises(DatasetInvalid, match=r"it holds no pictures .*; sweep\.avi is not read as it is: write its"):
+        load_dataset(folder)
+
+
+def test_pictures_of_several_folders_are_never_mixed_up(write):
+    rows = table(TIMES, PLACES, quaternions())
+    folder = write(NAMES, rows, pictures="images")
+    (folder / "annotations").mkdir()
+    for number, frame in enumerate(FRAMES):
+        cv2.imwrite(str(folder / "annotations" / f"frame_{number}.png"), 255 - frame)
+    with pytest.raises(
+        DatasetInvalid, match="pictures lie in several folders, annotations, images: name them as FOLDER"
+    ):
+        load_dataset(folder)
+    named = [[*row, f"images/frame_{number}.png"] for number, row in enumerate(rows)]
+    check(write(NAMES + ",file", named, pictures="images"))
+    ambiguous = [[*row, f"frame_{number}.png"] for number, row in enumerate(rows)]
+    with pytest.raises(DatasetInvalid, match="pictures lie in several folders"):
+        load_dataset(write(NAMES + ",file", ambiguous, pictures="images"))
+
+
+def test_a_picture_beside_the_folder_of_pictures_and_hidden_files_are_none_of_them(write):
+    named = [[*row, f"frame_{number}.png"] for number, row in enumerate(table(TIMES, PLACES, quaternions()))]
+    folder = write(NAMES + ",file", named, pictures="images")
+    cv2.imwrite(str(folder / "overview.png"), FRAMES[0])
+    (folder / "images" / "._frame_0.png").write_bytes(b"of a Mac")
+    check(folder)
+    assert not any("without a row" in note for note in load_dataset(folder).train.notes)
+    bare = write(NAMES, WHOLE)
+    (bare / "overview.png").unlink()
+    (bare / "._frame_0.png").write_bytes(b"of a Mac")
+    check(bare)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (
+            1.7e9 + TIMES,
+            r"none of 12 pictures has a pose: pictures are of 1700000003\.000 to .* s, rows of 3\.000 to 3\.5",
+        ),
+        (1.7e12 + 1000 * TIMES, "were the clocks other ones, or is a unit wrong"),
+        (["2026-03-01T10:00:00"] * COUNT, "row 2: time_s must be a number, got '2026-03-01T10:00:00': write dates"),
+    ],
+)
+def test_pictures_and_rows_of_other_clocks_are_one_clear_error(write, times, message):
+    folder = write(NAMES, WHOLE)
+    lines = [f"frame_{number}.png,{time}" for number, time in enumerate(times)]
+    (folder / "images.csv").write_text("\n".join(["file,time_s", *lines]))
+    with pytest.raises(DatasetInvalid, match=message):
+        load_dataset(folder)
+
+
+def test_pictures_between_rows_that_lie_far_apart_are_told(write):
+    folder = write(NAMES, [WHOLE[place] for place in (0, 6, 7, 11)])
+    (folder / "images.csv").write_text("\n".join(["file,time", *(f"frame_{n}.png,{t}" for n, t in enumerate(TIMES))]))
+    (told,) = (note for note in load_dataset(folder).train.notes if "left out" in note)
+    assert told == "pictures without a pose between rows at most 200 ms apart were left out: 1, 2, 3, 4, 5 (5 in all)"
