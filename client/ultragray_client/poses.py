@@ -29,10 +29,10 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
     Raises InvalidPose, naming the pose, for anything else: wrong shape, non-finite, scaled, sheared, mirrored, a last
     row other than 0 0 0 1, or a position beyond a kilometre.
     """
-    given = _as_float64(poses, field)
-    array = given[None] if given.ndim == 2 else given
+    values = _as_float64(poses, field)
+    array = values[None] if values.ndim == 2 else values
     if array.ndim != 3 or array.shape[1:] != (4, 4):
-        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {list(given.shape)}", field=field)
+        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {list(values.shape)}", field=field)
     if len(array) == 1 and _is_exact(array[0].tolist()):
         return array.copy()
     rotations = array[:, :3, :3]
@@ -43,7 +43,7 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
         rigid &= np.abs(array[:, :3, 3]).max(axis=1, initial=0.0) <= MAX_POSITION_MM
     if not rigid.all():
         first = int(np.argmin(rigid))
-        name = field if given.ndim == 2 else f"{field}[{first}]"
+        name = field if values.ndim == 2 else f"{field}[{first}]"
         raise _why_not_rigid(array[first], float(deviations[first]), name)
     exact: FloatArray = array.copy()
     exact[:, 3] = _IDENTITY[3]

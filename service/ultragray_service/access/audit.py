@@ -73,7 +73,7 @@ def account() -> Account:
     return _account.get() or Account()
 
 
-class AskedDatabase:
+class DatabaseWatch:
     """Tells the log once that a database is away, and once that it is back."""
 
     def __init__(self, away: str, back: str, log: logging.Logger) -> None:
@@ -103,7 +103,7 @@ class AuditLog:
         self._tallies: dict[Entry, int] = {}
         self._different: Counter[str] = Counter()  # tallies by callers
         self._lost = 0
-        self._database = AskedDatabase("the audit log waits in memory", "the audit log is written again", _log)
+        self._database = DatabaseWatch("the audit log waits in memory", "the audit log is written again", _log)
         self._engine: sa.Engine | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)

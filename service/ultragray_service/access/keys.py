@@ -16,7 +16,7 @@ import sqlalchemy as sa
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument
-from ultragray_service.access.audit import AskedDatabase
+from ultragray_service.access.audit import DatabaseWatch
 from ultragray_service.access.credentials import digest_of
 from ultragray_service.access.principals import Number, Principal, Role
 from ultragray_service.errors import Unauthenticated
@@ -174,7 +174,7 @@ class Snapshot:
         """Fills `keys` and calls `copies`; the first copy is there when this returns. Raises DatabaseUnavailable."""
         self._engine, self._keys, self._copies = engine, keys, copies
         self._number: int | None = None
-        self._database = AskedDatabase(f"{_COPIED} stay as they are for now", f"{_COPIED} are read again", _log)
+        self._database = DatabaseWatch(f"{_COPIED} stay as they are for now", f"{_COPIED} are read again", _log)
         self._stop = threading.Event()
         self.refresh()
         self._thread = threading.Thread(target=self._run, name="access", daemon=True)

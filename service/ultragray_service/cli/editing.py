@@ -49,7 +49,7 @@ from ultragray_service.cli.terminal import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class AskedEdits(Contract):
+class EditOptions(Contract):
     """Edits as options give them: those of a document, then the short forms."""
 
     __topic__ = "Edits, in this order"
@@ -105,7 +105,7 @@ def edit(
     force: Force = False,
     json: Json = False,
     *,
-    edits: AskedEdits,
+    edits: EditOptions,
 ) -> None:
     """The scene stays as it is: the new one names it as its parent. Scenes that are merged are files."""
     check_file(output, [SCENE_SUFFIX, COMPRESSED_SUFFIX], force=force)

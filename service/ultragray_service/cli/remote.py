@@ -31,8 +31,8 @@ from ultragray.scene.recipes import read_recipe
 from ultragray_service.cli.connection import CHECK_TIMEOUT_S, Connection, Resource, route, with_connection
 from ultragray_service.cli.editing import (
     RECIPE_FIELDS,
-    AskedEdits,
     CtOption,
+    EditOptions,
     LabelsArgument,
     TissueOption,
     left_out,
@@ -284,7 +284,7 @@ def edit_scene(
     private: Annotated[bool, option("Others do not see the scene that is made.", "--private")] = False,
     json: Json = False,
     *,
-    edits: AskedEdits,
+    edits: EditOptions,
 ) -> None:
     """Have the service edit a scene, as another one that names its parents. Merged scenes are the service's, too."""
     body = {"into": into, "private": private, "edits": to_dict(edits.listed(), with_none=False)}
