@@ -105,7 +105,7 @@ def read_dicom_sweep(
     notes += (*pixel_notes, *_header_notes(path, header, is_own=own is not None), *delay_note(delay_ns))
     chosen_s = None if times_s is None else times_s[numbers]
     if own is not None:
-        return replace(own.sweep(stored, poses, numbers, path, notes, crop), times_s=chosen_s), shape[0]
+        return own.sweep(stored, poses, numbers, path, notes, crop, chosen_s), shape[0]
     chain = Chain(
         (
             Link("pixels", "region", region.source, path.name),
@@ -274,9 +274,10 @@ class _OwnExport:
         path: Path,
         notes: tuple[str, ...],
         crop: str | None,
+        times_s: FloatArray | None,  # [F]
     ) -> Sweep:
         inner = images[:, self.box.top : self.box.bottom, self.box.left : self.box.right]
-        sweep = ImageGeometry(self.probe, self.picture).sweep(inner, poses, numbers, path, notes, crop)
+        sweep = ImageGeometry(self.probe, self.picture).sweep(inner, poses, numbers, path, notes, crop, times_s)
         return replace(sweep, chain=Chain((Link("Probe", "Tracker", "pose", path.name, is_tracked=True),)))
 
 

@@ -437,4 +437,14 @@ def tracked_sweep(
         notes += (f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound",)
     region = region_of(size, shown.box, pixel_mm, image_to_sensor)
     notes = (*notes, *near_sensor(image_to_sensor), *shown.notes)
-    return Sweep(shown.frames, shown.poses, shown.probe, numbers, str(path), notes, region, chain, times_s)
+    return Sweep.of_recording(
+        shown.frames,
+        shown.poses,
+        shown.probe,
+        numbers,
+        str(path),
+        notes,
+        times_s=times_s,
+        region=region,
+        chain=chain,
+    )

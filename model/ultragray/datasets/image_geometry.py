@@ -50,6 +50,7 @@ class ImageGeometry:
         path: Path,
         notes: tuple[str, ...],
         crop: str | None,
+        times_s: FloatArray | None = None,  # [F]
     ) -> Sweep:
         """The frames as scan lines. Raises InvalidArgument for a crop of what is not in mm, DatasetInvalid."""
         size = images.shape[1], images.shape[2]
@@ -58,7 +59,8 @@ class ImageGeometry:
             images, picture = images[:, :, ::-1], picture.flipped()
         shown = self._as_lines(picture, path)
         if shown is not None and crop is None:
-            return Sweep(np.ascontiguousarray(images), poses, shown, numbers, str(path), notes)
+            frames = np.ascontiguousarray(images)
+            return Sweep.of_recording(frames, poses, shown, numbers, str(path), notes, times_s=times_s)
         pixel_mm, image_to_probe = picture.step, _pixel_to_probe(picture)
         if picture.column_unit == "mm" and probe.is_true_to_scale:
             box = parse_crop(crop, *size)
@@ -76,7 +78,8 @@ class ImageGeometry:
                 "pixel_mm, or export them as mcap"
             )
         region: ImageRegion = region_of(size, box, pixel_mm, image_to_probe)
-        return Sweep(np.ascontiguousarray(images), poses, probe, numbers, str(path), notes, region)
+        frames = np.ascontiguousarray(images)
+        return Sweep.of_recording(frames, poses, probe, numbers, str(path), notes, times_s=times_s, region=region)
 
     def _picture(self, size: tuple[int, int]) -> Picture:
         if self.grid is None:

@@ -346,10 +346,10 @@ def read_mcap_sweep(
         *pixel_notes,
         *delay_note(delay_ns),
     )
-    sweep = geometry.sweep(images, poses[known], with_pose, path, notes, crop)
+    times_s = (times.times_ns[known] - times.times_ns.min()) / NS_PER_S
+    sweep = geometry.sweep(images, poses[known], with_pose, path, notes, crop, times_s)
     pixels = Link("pixels", way.links[0].origin, "geometry", geometry_source)
-    seconds = (times.times_ns[known] - times.times_ns.min()) / NS_PER_S
-    return replace(sweep, chain=Chain((pixels, *way.links), way.left_out), times_s=seconds), count
+    return replace(sweep, chain=Chain((pixels, *way.links), way.left_out)), count
 
 
 class _Contents:

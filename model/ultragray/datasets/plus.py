@@ -116,7 +116,7 @@ def read_plus_sweep(
         numbers, poses = numbers[is_known], poses[is_known]
         times_s = None if times_s is None else times_s[is_known]
     shown = shown_frames(images[numbers], poses, linear, box, fan_geometry, pixel_mm)
-    sweep = Sweep(
+    sweep = Sweep.of_recording(
         images=shown.frames,
         poses=shown.poses,
         probe=shown.probe,

@@ -73,7 +73,7 @@ def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
         raise DatasetInvalid(f"{images_path} holds {len(images)} images, but {poses_path} {count} poses")
     times_key = f"times_file_{part}"
     times_s = _read_times(_file(config, times_key), count)[numbers] if times_key in config.files else None
-    return Sweep(
+    return Sweep.of_recording(
         images=images if len(numbers) == count else images[numbers],
         poses=poses,
         probe=probe,

@@ -125,17 +125,40 @@ class Sweep:
         if len(self.poses) != count or len(self.frame_numbers) != count:
             raise DatasetInvalid(f"{self.source}: it holds {count} images but {len(self.poses)} poses")
         object.__setattr__(self, "poses", check_frame_poses(self.poses, self.frame_numbers, self.source))
-        constant = [place for place, image in enumerate(images) if image.min() == image.max()]
-        if len(constant) == 1:
-            raise DatasetInvalid(
-                f"{self.source}: frame {self.frame_numbers[constant[0]]} is constant: every pixel is "
-                f"{images[constant[0]].min()}; leave it out"
-            )
-        if constant:
-            raise DatasetInvalid(
-                f"{self.source}: frames {frame_list(self.frame_numbers[constant])} are constant, as of a probe that "
-                "was lifted off; leave them out"
-            )
+        for number, image in zip(self.frame_numbers, images, strict=True):
+            if image.min() == image.max():
+                raise DatasetInvalid(
+                    f"{self.source}: frame {number} is constant: every pixel is {image.min()}; leave it out"
+                )
+
+    @classmethod
+    def of_recording(
+        cls,
+        images: ByteArray,  # [F, H, W]
+        poses: FloatArray,  # [F, 4, 4] mm, probe→tracker
+        probe: Probe,
+        frame_numbers: IntArray,  # [F]
+        source: str,
+        notes: tuple[str, ...] = (),
+        *,
+        times_s: FloatArray | None = None,  # [F]
+        region: ImageRegion | None = None,
+        chain: Chain = Chain(),
+    ) -> Sweep:
+        """The sweep without the frames in which every pixel is the same, as of a probe that was lifted off.
+
+        Its notes say which. Raises DatasetInvalid where these are all frames, and as Sweep does.
+        """
+        has_image = np.array([not image.size or image.min() < image.max() for image in images], bool)
+        if len(images) and not has_image.any():
+            raise DatasetInvalid(f"{source}: in each frame every pixel is the same: {frame_list(frame_numbers)}")
+        if not has_image.all():
+            lost = frame_numbers[~has_image]
+            listed = f"{frame_list(lost)} ({len(lost)} in all)"
+            notes += (f"frames in which every pixel is the same were left out: {listed}",)
+            images, poses, frame_numbers = images[has_image], poses[has_image], frame_numbers[has_image]
+            times_s = None if times_s is None else times_s[has_image]
+        return cls(images, poses, probe, frame_numbers, source, notes, region, chain, times_s)
 
     def __len__(self) -> int:
         return len(self.images)

@@ -120,6 +120,20 @@ def test_images_that_no_poses_lie_around_are_left_out_and_named(bag):
     )
 
 
+def test_frames_of_a_lifted_probe_are_left_out_with_their_times(bag):
+    bag.poses()
+    for number in range(COUNT):
+        time_ns, image = image_time_ns(number), image_at(number) * (number not in (3, 4))
+        bag.write("/us/image", ros.IMAGE, image_message(image, time_ns), time_ns)
+    dataset = load_dataset(bag.finish())
+    numbers, _, poses = parts(dataset)
+    assert numbers.tolist() == [0, 1, 2, *range(5, COUNT)]
+    np.testing.assert_allclose(poses, [pose_at(number) for number in numbers], atol=1e-9)
+    times_s = np.sort(np.concatenate([dataset.train.times_s, dataset.val.times_s]))
+    np.testing.assert_allclose(times_s, [(image_time_ns(number) - image_time_ns(0)) / SECOND for number in numbers])
+    assert "frames in which every pixel is the same were left out: 3, 4 (2 in all)" in dataset.train.notes
+
+
 def test_poses_of_a_lost_probe_are_gaps(bag):
     lost = {10: {"position": {"x": float("nan"), "y": 0.0, "z": 0.0}}, 20: {"orientation": dict.fromkeys("xyzw", 0.0)}}
 

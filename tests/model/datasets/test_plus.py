@@ -133,6 +133,15 @@ def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 
 
+def test_frames_of_a_lifted_probe_are_left_out_and_told(tmp_path, plus_files, device_set):
+    stored = plus_files.speckle(6, ROWS, COLUMNS)
+    stored[[1, 4]] = 0
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(6))
+    sweep, _ = read_plus_sweep(path, device_set=device_set)
+    assert sweep.frame_numbers.tolist() == [0, 2, 3, 5]
+    assert sweep.notes[-1] == "frames in which every pixel is the same were left out: 1, 4 (2 in all)"
+
+
 @pytest.mark.parametrize("suffix", ["mha", "nrrd"])
 def test_fields_that_do_not_go_with_the_images_are_told_or_refused(tmp_path, plus_files, device_set, suffix):
     stored, fields = plus_files.speckle(4, ROWS, COLUMNS), plus_files.tracked_fields(7)
@@ -172,11 +181,7 @@ def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
     refused("frame 2: ProbeToTracker must be sixteen finite", {key: "1 0 0"})
     refused("images must be B-mode .* RF_REAL", {"UltrasoundImageType": "RF_REAL"})
     refused("UltrasoundImageOrientation must be", {"UltrasoundImageOrientation": "AMF"})
-    constant = stored.copy()
-    constant[1] = 3
-    refused("frame 1 is constant: every pixel is 3; leave it out", {}, constant)
-    constant[0] = 0
-    refused("frames 0, 1 are constant, as of a probe that was lifted off; leave them out", {}, constant)
+    refused("in each frame every pixel is the same: 0, 1, 2", {}, np.full_like(stored, 3))
     refused(
         "none of its 3 frames has a valid ProbeToTracker",
         {f"Seq_Frame{frame:04d}_ProbeToTrackerTransformStatus": "INVALID" for frame in range(3)},

@@ -158,11 +158,11 @@ def test_convert_leaves_names_out(folder):
 
 
 def test_bad_data_is_one_line_and_exit_code_two(folder):
-    images = np.load(folder / "images_train.npy")
-    images[3] = 0
-    np.save(folder / "images_train.npy", images)
+    poses = np.load(folder / "poses_train.npy")
+    poses[3, 0, 3] = np.inf
+    np.save(folder / "poses_train.npy", poses)
     for command in (["check"], ["convert", "-o", folder.parent / "other"], ["draw", "-o", folder.parent / "a.png"]):
-        assert "images_train.npy: frame 3 is constant" in refused(command[0], folder, *command[1:])
+        assert "frame 3: its pose must be finite" in refused(command[0], folder, *command[1:])
     assert sorted(path.name for path in folder.parent.iterdir()) == ["tiny"]
 
 
