@@ -20,7 +20,7 @@ import {
   SOURCES,
   until,
 } from "./harness.mjs";
-import { changed, IMAGE, poseOf } from "./scan_page.mjs";
+import { changed, enterPose, IMAGE, poseOf } from "./scan_page.mjs";
 import { makeSweep } from "./sweep.mjs";
 
 const MINUTES_MS = 900_000; // a training and a thousand frames on a busy machine
@@ -64,16 +64,16 @@ function vesselOf(page) {
     const around = Array.from({ length: 24 }, (_, i) => [Math.cos((i * Math.PI) / 12), Math.sin((i * Math.PI) / 12)]);
     const ring = (x, y, radius) => around.map(([dx, dy]) => grey(x + radius * dx, y + radius * dy));
     const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
-    const radius = 0.035 * width; // of 60 mm: a little less than the vessel's
+    const [within, beyond] = [0.027 * width, 0.06 * width]; // of 60 mm; the vessel's radius lies between
     let best = { contrast: -Infinity };
     for (let y = 0.2 * height; y < 0.7 * height; y += 1)
       for (let x = 0.1 * width; x < 0.9 * width; x += 1) {
-        const inside = [grey(x, y), ...ring(x, y, radius / 2), ...ring(x, y, radius)];
-        const outside = ring(x, y, 1.7 * radius).sort((a, b) => a - b);
+        const inside = [grey(x, y), ...ring(x, y, within / 2), ...ring(x, y, within)];
+        const outside = ring(x, y, beyond).sort((a, b) => a - b);
         const contrast = outside[1] - Math.max(...inside); // a shadow is dark around as well
         if (contrast > best.contrast) best = { contrast, x, y };
       }
-    const wall = mean(ring(best.x, best.y, 1.7 * radius)) / 2;
+    const wall = mean(ring(best.x, best.y, beyond)) / 2;
     const reach = (side) => {
       let dx = 0;
       while (grey(best.x + side * dx, best.y) < wall) dx += 1;
@@ -94,6 +94,7 @@ describe("a sonographer", () => {
     const seen = walker(page, "sonographer");
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     await seen("arrives");
+    const start = await poseOf(page);
 
     await page.getByLabel("Gain", { exact: true }).fill("4");
     const brighter = await changed(page, first.print);
@@ -101,6 +102,9 @@ describe("a sonographer", () => {
     await changed(page, brighter.print);
     await page.waitForTimeout(1500);
     await page.getByRole("button", { name: "Pause the sweep" }).click();
+    const paused = await canvasState(page, IMAGE);
+    await enterPose(page, JSON.stringify(start)); // where the sweep pauses, the vessel may be cut at a slant
+    await changed(page, paused.print);
     await page.locator(`${IMAGE} .steer`).focus();
     const before = await canvasState(page, IMAGE);
     for (let tap = 0; tap < 6; tap++) await page.keyboard.press("ArrowRight");
