@@ -118,7 +118,7 @@ class LocalScene implements Scene {
   ) {}
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
-    const { view, info } = await this.#view(JSON.stringify(settings));
+    const { view, info } = await this.#view(textOf(settings));
     const frame = await this.thread.ask<Drawn>({ act: "render", view, pose: checked(pose) });
     [this.renderer, this.workers] = [frame.renderer, frame.workers];
     const figures = Object.keys(EXTRAPOLATION).map((name, at) => [name, Number.isNaN(frame.figures[at]) ? null : frame.figures[at]]);
@@ -214,7 +214,9 @@ class ServedScene implements Scene {
   #socket: Promise<WebSocket> | undefined;
   #sequence = 0;
   #waiting = new Map<number, Waiting>();
-  #sent = "";
+  #settings = ""; // of the newest message
+  #settingsSince = 0; // the first message that had these
+  #drawn = 0; // the newest message that got a frame
   #latencies_ms: number[] = [];
   /** Of the newest answer: it aligns the clocks. */
   #newest: { answer_sent_ms: number; answer_arrived_ms: number } | undefined;
@@ -227,17 +229,17 @@ class ServedScene implements Scene {
   ) {}
 
   async render(pose: Pose, settings: Settings = {}): Promise<Frame> {
-    const matrix = checked(pose);
+    const [matrix, written] = [checked(pose), textOf(settings)];
     this.#socket ??= this.#open();
     const socket = await this.#socket;
     return new Promise((resolve, reject) => {
       this.#sequence += 1;
       const asked_ms = performance.now();
       this.#waiting.set(this.#sequence, { asked_ms, resolve, reject });
-      const written = JSON.stringify(settings);
+      if (written !== this.#settings) [this.#settings, this.#settingsSince] = [written, this.#sequence];
       const rows = [0, 4, 8, 12].map((at) => matrix.slice(at, at + 4));
-      const changed = written === this.#sent ? {} : { settings };
-      this.#sent = written;
+      // Settings that are refused leave those before them: they are sent until a frame of them has come.
+      const changed = this.#drawn >= this.#settingsSince ? {} : { settings };
       const clock = this.#newest && { ...this.#newest, sent_ms: performance.now() };
       const times = { client_time_ms: asked_ms, clock, ...this.#ahead() };
       socket.send(JSON.stringify({ sequence: this.#sequence, mode: "ordered", pose: { matrix: rows }, ...times, ...changed }));
@@ -262,12 +264,12 @@ class ServedScene implements Scene {
       socket.onopen = () => resolve(socket);
       socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => this.#take(data);
       socket.onclose = () => {
-        const lost = new Error(`the connection to ${this.address.host} ended`);
+        const lost = new Error(`the connection to ${this.address.host} ended, or could not be opened`);
         reject(lost);
         for (const { reject: refuse } of this.#waiting.values()) refuse(lost);
         this.#waiting.clear();
         this.#socket = this.#newest = undefined; // the next pose opens another
-        this.#sent = "";
+        this.#settings = "";
       };
     });
   }
@@ -275,7 +277,6 @@ class ServedScene implements Scene {
   #take(data: ArrayBuffer | string): void {
     if (typeof data === "string") {
       const { sequence, error } = JSON.parse(data) as Schemas["RefusalMessage"];
-      this.#sent = ""; // settings that were refused are not those of the stream
       this.#settle(sequence)?.reject(new Error(error.detail));
       return;
     }
@@ -283,6 +284,7 @@ class ServedScene implements Scene {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Schemas["FrameMessage"];
     this.#newest = { answer_sent_ms: header.sent_ms, answer_arrived_ms };
+    this.#drawn = header.sequence;
     const begin = Math.ceil((4 + length) / 8) * 8;
     const waiting = this.#settle(header.sequence);
     if (waiting === undefined) return;
@@ -301,6 +303,16 @@ class ServedScene implements Scene {
 function checked(pose: Pose): number[] {
   if (pose.length !== 16) throw new Error(`a pose must have 16 numbers, [4, 4] row by row, got ${pose.length}`);
   return [...pose];
+}
+
+/** The settings as JSON. Throws for numbers that JSON would leave out, and for encodings that are not pixels. */
+function textOf(settings: Settings): string {
+  const encoding = settings.encoding ?? "uint8";
+  if (!(encoding in BYTES)) throw new Error(`encoding must be one of ${Object.keys(BYTES).join(", ")}, got ${encoding}`);
+  return JSON.stringify(settings, (name, value: unknown) => {
+    if (typeof value === "number" && !Number.isFinite(value)) throw new Error(`settings must hold finite numbers, got ${value} as ${name}`);
+    return value;
+  });
 }
 
 async function opened(part: Part | Promise<Part>, drawing: Drawing): Promise<Scene> {
@@ -367,7 +379,10 @@ export const Scene = {
   async connect(service: string | URL, name: string, { key, seenAfter_ms }: ConnectOptions = {}): Promise<Scene> {
     const address = new URL(`/v1/scenes/${encodeURIComponent(name)}`, service);
     const answer = await fetch(address, key === undefined ? {} : { headers: { Authorization: `Bearer ${key}` } });
-    if (!answer.ok) throw new Error(`${address.href} answers ${answer.status} ${answer.statusText}`);
+    if (!answer.ok) {
+      const problem = (await answer.json().catch(() => ({}))) as Partial<Schemas["Problem"]>; // a proxy answers otherwise
+      throw new Error(problem.detail ?? `${address.href} answers ${answer.status} ${answer.statusText}`);
+    }
     const info = (await answer.json()) as SceneInfo;
     const stream = new URL(`${address.pathname}/stream`, address);
     stream.protocol = address.protocol === "https:" ? "wss:" : "ws:";

@@ -73,7 +73,7 @@ export function score(task: Task, run: readonly Moment[]): Score {
     path_mm: sum((before, after) => length(minus(faceOf(task.probe, after.pose), faceOf(task.probe, before.pose)))),
     path_deg: sum((before, after) => angle_deg(before.pose, after.pose)),
     smoothness: smoothness(moments.map(({ time_s, pose }) => ({ time_s, at: faceOf(task.probe, pose) }))),
-    coverage: seen === undefined ? null : seen.length / task.region!.length,
+    coverage: seen === undefined || task.region!.length === 0 ? null : seen.length / task.region!.length,
     contact_share: !isJudged ? null : time_s > 0 ? touched_s / time_s : end.contact_share!,
     reward: end.similarity === undefined ? null : end.similarity - 1 + ((end.contact_share ?? 1) - 1),
   };

@@ -11,11 +11,13 @@ const started = (): Worker => new Worker(new URL("worker.js", import.meta.url), 
 export class Asker {
   #number = 0;
   #asked = new Map<number, { resolve: (result: unknown) => void; reject: (error: Error) => void }>();
+  #ended: Error | undefined; // nothing answers any more
 
   constructor(private readonly port: Worker | MessagePort) {}
 
   ask<Result>(request: Request): Promise<Result> {
     return new Promise((resolve, reject) => {
+      if (this.#ended !== undefined) return reject(this.#ended);
       this.#number += 1;
       this.#asked.set(this.#number, { resolve: resolve as (result: unknown) => void, reject });
       this.port.postMessage({ number: this.#number, request });
@@ -29,7 +31,9 @@ export class Asker {
     else asked?.reject(new Error(problem));
   }
 
+  /** Rejects, with the error, what was asked and what will be. */
   end(error: Error): void {
+    this.#ended = error;
     for (const { reject } of this.#asked.values()) reject(error);
     this.#asked.clear();
   }

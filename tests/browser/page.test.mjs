@@ -287,10 +287,23 @@ test("what is wrong is said in a sentence", async () => {
       await told(() => scene.render(pose, { height: 0 })),
       await told(() => scene.render(pose.slice(1))),
       await told(() => scene.render(pose.map((one) => 2 * one))),
+      await told(() => scene.render(pose, { display: { gain_db: NaN } })),
+      await told(() => scene.render(pose, { encoding: "png" })),
       await told(() => scene.render(pose, { height: 4 })),
+      await told(() => (scene.close(), scene.render(pose))),
     ];
   });
-  const expected = [/cut off/, /not-there\.ugr cannot be fetched: 404/, /height must be/, /16 numbers/, /^pose(s\[0\])? must end in the row 0 0 0 1$/, /^nothing$/];
+  const expected = [
+    /cut off/,
+    /not-there\.ugr cannot be fetched: 404/,
+    /height must be/,
+    /16 numbers/,
+    /^pose(s\[0\])? must end in the row 0 0 0 1$/,
+    /^settings must hold finite numbers, got NaN as gain_db$/,
+    /^encoding must be one of uint8, float32, float16, got png$/,
+    /^nothing$/,
+    /^the scene is closed$/,
+  ];
   problems.forEach((problem, at) => assert.match(problem, expected[at]));
   await page.close();
 });
@@ -524,6 +537,10 @@ test("a scene of a service is rendered behind the same interface", async () => {
         extrapolations.push(frames.map((frame) => frame.extrapolation));
       }
       const refused = await served.render(poses[0], { height: 0 }).catch((error) => error.message);
+      const atOnce = [{ height: 0 }, { height: 0 }, { height: 20, width: 30 }, { height: 0 }, { height: 0 }, { height: 20, width: 30 }];
+      const answers = await Promise.all(atOnce.map((one) => served.render(poses[0], one).then(({ info }) => info.height, () => null)));
+      const picture = await served.render(poses[0], { encoding: "png" }).catch((error) => error.message);
+      const nobody = await Scene.connect(location.origin, "nobody").catch((error) => error.message);
       const again = await served.render(poses[0], settings);
       const halves = await Promise.all([local, served].map((scene) => scene.render(poses[0], { height: 9, encoding: "float16" })));
       const doubts = await Promise.all(
@@ -533,7 +550,7 @@ test("a scene of a service is rendered behind the same interface", async () => {
       const mixed = { height: 40, width: 30, encoding: "float32", outputs: ["labels", "bmode"] };
       const both = await Promise.all([local, served].map((scene) => scene.render(poses[0], mixed)));
       const labelled = both.map((frame) => [frame.pixels("labels").constructor.name, [...frame.pixels("labels")], [...frame.pixels("bmode")]]);
-      return { labelled, most, extrapolations, pixels, doubts, refused, width: again.info.width, clock: again.info.clock, same: local.info.image_height === served.info.image_height };
+      return { answers, picture, nobody, labelled, most, extrapolations, pixels, doubts, refused, width: again.info.width, clock: again.info.clock, same: local.info.image_height === served.info.image_height };
     });
     assert.ok(apart.most <= 1, `grey values are ${apart.most} apart`);
     for (const [local, served] of apart.extrapolations)
@@ -545,6 +562,9 @@ test("a scene of a service is rendered behind the same interface", async () => {
     assert.ok(apart.labelled[0][2].every((value, at) => Math.abs(value - apart.labelled[1][2][at]) < 5e-4));
     for (const doubt of apart.doubts) assert.match(doubt, /has a confidence of 0\.\d\d, 1 is asked for: the nearest/);
     assert.match(apart.refused, /height must be/);
+    assert.deepEqual(apart.answers, [null, null, 20, null, null, 20], "frames have settings that were not asked for");
+    assert.match(apart.picture, /^encoding must be one of uint8, float32, float16, got png$/);
+    assert.match(apart.nobody, /^there is no scene 'nobody'; known scenes: demo$/);
     assert.equal(apart.width, 80);
     assert.ok(apart.clock, "the clocks are not aligned");
     assert.ok(apart.same);

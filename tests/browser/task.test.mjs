@@ -57,6 +57,7 @@ test("a region is seen where the image passes over it", () => {
   const region = [0, 4, 8, 12].map((y) => [0, y, 20]).concat([[30, 0, 20]]);
   const far = moved(HERE, { z: 100 });
   near(score({ probe: LINEAR, target: far, region }, run(2, (t) => ({ y: 4 * t }))).coverage, 3 / 5);
+  assert.equal(score({ probe: LINEAR, target: far, region: [] }, run(1, () => ({}))).coverage, null);
   const kinds = [
     [{ kind: "steered", width_mm: 40, steering_deg: 40, near_mm: 0, far_mm: 50 }, [30, 0, 20], [-19, 0, 20]],
     [{ kind: "phased", opening_angle_deg: 60, far_mm: 50 }, [11, 0, 20], [13, 0, 20]],

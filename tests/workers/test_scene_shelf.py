@@ -89,6 +89,16 @@ def test_a_folder_keeps_the_promises_of_a_bucket(tmp_path, scene_folder):
     assert other.names() == set()
 
 
+def test_a_scene_whose_file_has_a_name_that_no_scene_can_have_is_told_of_once(tmp_path, scene_folder, caplog):
+    for name in ("Übung 3.ugr", ".being-written.ugr"):
+        (tmp_path / name).write_bytes((scene_folder / "a.ugr").read_bytes())
+    shelf = SceneShelf(open_storage(tmp_path))
+    assert [shelf.names() for _ in range(2)] == [{"a", "b"}] * 2
+    (told,) = caplog.messages
+    assert told.startswith("'Übung 3.ugr' in ")
+    assert "is not served: scenes are served by the name of their file" in told
+
+
 def sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 

@@ -93,6 +93,7 @@ class SceneShelf:
         self._read_at_s: float | None = None  # time.monotonic()
         self._tried_at_s = 0.0
         self._entries: dict[str, tuple[str, Placed | None]] = {}  # by name: the version of NAME.json, and what it says
+        self._misnamed: set[str] = set()  # keys of scene files that are left out, and were told
         self._changes = 0  # by this process
         self._changing, self._reading = threading.Lock(), threading.Lock()
         self._stop = threading.Event()
@@ -375,7 +376,14 @@ class SceneShelf:
         entries: dict[str, Entry] = {}
         for entry in self.storage.entries_in(self._prefix):
             path = PurePosixPath(entry.key)
-            if is_scene_name(path.stem) and path.suffix in SUFFIXES:
+            if path.suffix in SUFFIXES and not is_scene_name(path.stem):
+                if entry.key not in self._misnamed and not path.name.startswith("."):
+                    self._misnamed.add(entry.key)
+                    _log.warning(
+                        f"{entry.key!r} in {self.storage.location} is not served: scenes are served by the name of "
+                        "their file, at most 128 letters (a-z, A-Z), digits, '.', '_', '-', the first a letter or digit"
+                    )
+            elif path.suffix in SUFFIXES:
                 if path.suffix == SUFFIX or path.stem not in copied:
                     copied[path.stem] = Placed(entry.key, entry.version, entry.bytes, None)
             elif is_scene_name(path.stem) and path.suffix == ENTRY_SUFFIX:

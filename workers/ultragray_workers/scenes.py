@@ -47,7 +47,7 @@ class SceneStore:
         self._hashing = threading.Lock()
 
     def names(self) -> list[str]:
-        """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
+        """The names of all scenes, sorted; the log names files whose name could not stand in a URL."""
         return sorted({name for shelf in self.shelves for name in shelf.names()})
 
     def shown_names(self) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from fastapi import Depends, Path, Query
+from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 from starlette.types import Receive
@@ -145,14 +146,14 @@ async def revalidated(
 ) -> Response:
     """What `make` gives, with `version` (letters, digits, '-') as ETag; 304 where the client has that version."""
     headers = {"ETag": f'"{version}"', "Cache-Control": "private, no-cache"}
-    if is_known(request, headers["ETag"]):
+    if is_known(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return Response(await make(), media_type=media_type, headers=headers)
 
 
-def is_known(request: Request, tag: str) -> bool:
+def is_known(headers: Headers, tag: str) -> bool:
     """Whether the client has what the ETag names (If-None-Match)."""
-    return tag in (known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(","))
+    return tag in (known.strip().removeprefix("W/") for known in headers.get("if-none-match", "").split(","))
 
 
 DEMO_SCENE = "demo"

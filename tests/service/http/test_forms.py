@@ -204,3 +204,9 @@ def test_a_download_of_another_content_begins_anew(get):
     assert (same.status_code, len(same.content)) == (206, len(CONTENT) - 10)
     other = get("/shared", headers={"Range": "bytes=10-", "If-Range": '"of another"'})
     assert (other.status_code, other.content) == (200, CONTENT)
+
+
+def test_a_file_that_the_client_has_is_not_sent_again(get):
+    etag = get("/shared").headers["etag"]
+    again = get("/shared", headers={"If-None-Match": etag})
+    assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", etag)

@@ -324,6 +324,11 @@ def test_a_compressed_scene_is_served_like_any_other(http, demo_scene):
         for form in ("file", "file.ugz"):
             whole = http.get(f"/v1/scenes/small/{form}")
             assert whole.content == sent
+            assert whole.headers["cache-control"] == "private, no-cache"
+            again = http.get(f"/v1/scenes/small/{form}", headers={"If-None-Match": whole.headers["etag"]})
+            assert (again.status_code, again.content) == (304, b""), form
+            assert again.headers["etag"] == whole.headers["etag"]
+            assert http.get(f"/v1/scenes/small/{form}", headers={"If-None-Match": '"another"'}).status_code == 200
             assert 'filename="small.ugz"' in whole.headers["content-disposition"]
         assert http.post("/v1/scenes/small/render", json={"pose": POSE}).status_code == 200
         _, points = points_of(http.get("/v1/scenes/small/gaussians"))

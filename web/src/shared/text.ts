@@ -11,7 +11,9 @@ const UNITS = ["B", "KB", "MB", "GB", "TB"];
 export function bytes(count: number): string {
   const power = Math.min(UNITS.length - 1, Math.floor(Math.log10(Math.max(1, count)) / 3));
   const value = count / 1000 ** power;
-  return `${value.toFixed(power === 0 || value >= 100 ? 0 : 1)} ${UNITS[power]}`;
+  const digits = power === 0 || value >= 100 ? 0 : 1;
+  const written = value.toLocaleString(language.current, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  return `${written} ${UNITS[power]}`;
 }
 
 export function duration(seconds: number): string {
@@ -22,10 +24,11 @@ export function duration(seconds: number): string {
   return `${Math.floor(whole_min / 60)} h ${whole_min % 60} min`;
 }
 
-/** A name that scenes and datasets may have, made of a file's. */
+/** A name that scenes and datasets may have, made of a file's: letters without their marks, dashes for what cannot stand in it. */
 export function nameOfFile(file: string): string {
   const stem = file.replace(/(\.igs)?\.[A-Za-z0-9]+$/, "").replace(/\.tar$/, "");
-  return stem.replace(/[^A-Za-z0-9._-]+/g, "-").replace(/^[._-]+/, "").slice(0, 128);
+  const plain = stem.normalize("NFD").replace(/\p{Mark}/gu, "");
+  return plain.replace(/[^A-Za-z0-9._-]+/g, "-").replace(/^[._-]+/, "").slice(0, 128);
 }
 
 export const NAME_PATTERN = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,127}";

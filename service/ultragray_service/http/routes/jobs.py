@@ -31,7 +31,16 @@ from ultragray_service.core.jobs import (
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
-from ultragray_service.http.dependencies import JOB_EXAMPLES, Answers, PageToken, ServiceDep, answer, problems
+from ultragray_service.http.dependencies import (
+    JOB_EXAMPLES,
+    NOT_MODIFIED,
+    Answers,
+    PageToken,
+    ServiceDep,
+    answer,
+    is_known,
+    problems,
+)
 from ultragray_service.views.prepared import TrainingCurve
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
@@ -225,7 +234,11 @@ async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEF
     return PlainTextResponse(await service.jobs.do(JobStore.log_tail, job, max_bytes))
 
 
-@router.get("/{job}/artifacts/{name}", response_class=FileResponse, responses=_FILE | problems(401, 404, 422, 503))
+@router.get(
+    "/{job}/artifacts/{name}",
+    response_class=FileResponse,
+    responses=_FILE | NOT_MODIFIED | problems(401, 404, 422, 503),
+)
 async def get_artifact(
     request: Request,
     service: ServiceDep,
@@ -271,6 +284,8 @@ def artifact_response(file: Artifact, request_headers: Headers, media_type: str,
         "content-disposition": f"{disposition}; filename*=utf-8''{quote(file.name)}",
         "etag": etag,
     }
+    if is_known(request_headers, etag):
+        return Response(status_code=304, headers={"etag": etag})
     start, end, status = 0, file.stored.bytes, 200
     if (
         request_headers.get("if-range", etag) == etag

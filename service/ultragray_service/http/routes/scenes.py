@@ -291,12 +291,23 @@ class OpenFileResponse(FileResponse):
             await super().__call__(scope, receive, send)
 
 
-@router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
-async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
+def _file_answer(request: Request, file: BinaryIO, filename: str, headers: Mapping[str, str]) -> Response:
+    """The answer to a GET of an open file; 304 where the client has what its ETag names."""
+    headers = {"Cache-Control": "private, no-cache", **headers}
+    answer = OpenFileResponse(file, filename=filename, headers=headers)
+    etag = answer.headers["etag"]
+    if not is_known(request.headers, etag):
+        return answer
+    file.close()
+    return Response(status_code=304, headers={**headers, "ETag": etag})
+
+
+@router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | NOT_MODIFIED | problems(401, 404, 422))
+async def download_scene(request: Request, service: ServiceDep, scene: SceneName) -> Response:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     header = await service.catalog.header(scene)
     file = await asyncio.to_thread(service.scene_store.open, scene)
-    return OpenFileResponse(file, filename=f"{base_name(scene)}{SUFFIXES[header.is_compressed]}")
+    return _file_answer(request, file, f"{base_name(scene)}{SUFFIXES[header.is_compressed]}", {})
 
 
 @router.get(
@@ -312,11 +323,7 @@ async def download_compressed_scene(request: Request, service: ServiceDep, scene
     service.life.require_serving()
     file = await service.compressed.open(scene)
     sha256 = await asyncio.to_thread(file_sha256, f"/dev/fd/{file.fileno()}")
-    headers = {"ETag": f'"{sha256}"', "Cache-Control": "private, no-cache"}
-    if is_known(request, headers["ETag"]):
-        file.close()
-        return Response(status_code=304, headers=headers)
-    return OpenFileResponse(file, filename=f"{base_name(scene)}{SUFFIXES[True]}", headers=headers)
+    return _file_answer(request, file, f"{base_name(scene)}{SUFFIXES[True]}", {"ETag": f'"{sha256}"'})
 
 
 @router.put(
