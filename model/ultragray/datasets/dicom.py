@@ -296,7 +296,8 @@ def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  #
     with _in_our_words(path):
         stored = int(header.get("BitsStored", 8))
         high = int(header.get("HighBit", stored - 1))
-    if bits not in (8, 16) or header.get("PixelRepresentation", 0) != 0:
+        is_signed = header.get("PixelRepresentation", 0) != 0
+    if bits not in (8, 16) or is_signed:
         raise DatasetInvalid(
             f"{path}: pixels must have 8 or 16 bits (BitsAllocated) without a sign, got {str(bits)[:40]}"
         )

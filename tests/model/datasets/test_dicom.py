@@ -171,6 +171,17 @@ def test_a_value_of_a_kind_that_does_not_exist(write, tmp_path):
         load_dataset(tmp_path / "sweep.dcm")
 
 
+@pytest.mark.parametrize("tag", [b"\x28\x00\x03\x01", b"\x28\x00\x00\x01", b"\x28\x00\x02\x00"])
+def test_a_header_with_a_damaged_kind_of_value_is_one_clear_error(write, tag):
+    """PixelRepresentation, BitsAllocated or SamplesPerPixel, whose value representation is none."""
+    path = write()
+    data = path.read_bytes()
+    assert data.count(tag + b"US") == 1
+    path.write_bytes(data.replace(tag + b"US", tag + b"UQ"))
+    with pytest.raises(DatasetInvalid, match="cannot be read as DICOM: Unknown Value Representation 'UQ'"):
+        load_dataset(path)
+
+
 def test_options_of_other_formats_are_refused(write, tmp_path):
     with pytest.raises(InvalidArgument, match=r"device_set is for PLUS sequences, sweep\.dcm is none"):
         load_dataset(write(), SourceOptions(device_set=tmp_path / "set.xml"))
